@@ -18,6 +18,7 @@ from ..ray import Progress, Scene, by_rules
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.volume import Volume, voxels_of, with_voxels, without_voxels
+from ..xla.compiling import compiled
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added, floats, is_none, zeros_of
 from .acceleration import VolumeAcceleration, empty_space_of
@@ -262,3 +263,6 @@ def _shader_of(
 
     _, pull, shader = jax.vjp(make_shader, moving, has_aux=True)
     return shader._replace(around=Surroundings(packed, transfer, march.locate(volume))), pull
+
+
+image_vjp = compiled(render_vjp, by_jvp=True)

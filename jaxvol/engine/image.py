@@ -3,10 +3,9 @@
 An image is one compiled program, and its gradient another; `gradients` has the VJP of `"replay"`.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -15,21 +14,18 @@ from jaxtyping import Array, Int
 from ..compositing.blending import OpticalDepths, Weighting
 from ..compositing.selection import Selection
 from ..ray import Scene, by_rules, check_channels, end
-from ..reference import step, steps_across
 from ..scene.camera import GivenRays, without_ends
 from ..scene.rendering import Rendering
-from ..scene.space import Ray, Space
+from ..scene.space import Ray
 from ..xla.compiling import compiled, in_program
-from ..xla.differentiation import forward_only, nan_derivatives, transformations
+from ..xla.differentiation import forward_only, transformations
 from ..xla.linear import differentiable, moving_leaves, recomputed
 from ..xla.platform import is_traced
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, constant, floats, strong
 from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import Devices, check_not_sharded, mesh_of, on_all, over_devices
-from .gradients import render_vjp
-from .ray_samples import leap_by_ray, scan_samples
-from .rays import RayTiles, vmap_rays
+from .rays import RayTiles, over_tiles, vmap_rays
 from .resolve import MarchResult, resolve_image, with_pixels
 from .shifts import begin_rays
 from .stages import is_staged, staged_image
@@ -81,8 +77,9 @@ def render_scene(
             raise ValueError(f'compositing must weight samples for outputs="samples", as "over"; got {name}.')
         adjoint, steps = "direct", most_samples
     elif adjoint == "direct":
-        # a multiple of 64, so that a change of step rarely compiles the program again
-        steps = min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
+        from .direct import steps_of  # here and below, since few images need it
+
+        steps = steps_of(volume, march)
     if lighting is not None:
         scene = scene._replace(lighting=lighting.baked(volume, scene.transfer, march))
     options = RenderOptions(outputs, tiling, adjoint, steps, most_samples is not None)
@@ -113,7 +110,9 @@ def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAccelera
 def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """The image, with the derivatives of its adjoint."""
     if options.adjoint == "direct":
-        return _direct_image(scene, options, acceleration)
+        from .direct import direct_image
+
+        return direct_image(scene, options, acceleration)
     if options.adjoint == "forward":
         return forward_only(_forward_image(scene, options, acceleration), WRONG_MODE["forward"])
     if not is_traced(scene):  # nothing is differentiated, and a custom rule takes milliseconds
@@ -152,46 +151,9 @@ def march_image(
             recorded = recorded.with_rays(rays, skips)
         return vmap_rays(partial(end, prepared))(rays, marched.at), recorded
 
-    rendering, recorded = _over_tiles(scene, prepared.space, tiles, march_tile)
+    rendering, recorded = over_tiles(scene, prepared.space, tiles, march_tile)
     rays, skips = jax.tree.map(lambda leaf: leaf[0], (recorded.rays, recorded.skips))
     return rendering, recorded._replace(rays=rays, skips=skips)
-
-
-def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
-    """The image by `options.steps` reference steps along each ray, which JAX differentiates; and, with
-    `options.samples`, the samples of those steps, which then do not lie in empty space."""
-    tiles = RayTiles.of(scene.source, options.tiling, direct=True)
-    scene = nan_derivatives(scene, scene.has_fault)
-    prepared = acceleration.prepared(scene)
-    index = empty_space_of(scene, acceleration, options.tiling) if options.samples else None
-
-    def scan_tile(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
-        one = vmap_rays(partial(step, prepared))
-        start = begin_rays(scene.march, prepared, rays, options.tiling, options.outputs, finds_shifts=False)
-        start = varying(start, rays)
-        if options.samples:
-            leap = leap_by_ray(prepared, options.tiling, index, rays, start.track)
-            at, samples = scan_samples(partial(one, rays), leap, rays, start, options.steps or 0)
-        else:
-            samples = None
-            at, _ = jax.lax.scan(lambda at, none: (one(rays, at)[0], none), start, None, length=options.steps)
-        rendering = vmap_rays(partial(end, prepared))(rays, at)
-        return replace(rendering, details=rendering.details._replace(ray_samples=samples)), None
-
-    return _over_tiles(scene, prepared.space, tiles, scan_tile)[0]
-
-
-def _over_tiles(
-    scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
-) -> tuple[Rendering, Any]:
-    """Calls `one(tile, rays)` for all tiles in sequence. Returns the image, and stacked second results."""
-    fault = scene.has_fault
-
-    def render_tile(inputs: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
-        return one(inputs[0], tiles.rays(scene.source, space, inputs[0], fault))
-
-    renderings, extra = tiles.map(render_tile)
-    return nan_derivatives(jax.tree.map(tiles.assemble, renderings), fault), extra
 
 
 def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
@@ -201,8 +163,6 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
 _forward_image = compiled(_marched_image, has_jvp=True)
 _compiled_image = compiled(_marched_image)
 _recorded_image = compiled(partial(march_image, record=True), by_jvp=True)
-_image_vjp = compiled(render_vjp, by_jvp=True)
-_direct_image = compiled(scan_image, has_jvp=True)
 _pixels_kept = compiled(resolve_image, has_jvp=True)
 _pixels_recomputed = recomputed(resolve_image, WRONG_MODE["replay"])
 
@@ -237,7 +197,9 @@ def _pull(
     options: RenderOptions,
     acceleration: VolumeAcceleration,
 ) -> PyTree:
-    return _image_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
+    from .gradients import image_vjp  # here, since images alone do not need it
+
+    return image_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
 
 
 _replayed = differentiable(

@@ -19,9 +19,12 @@ from jaxtyping import Array, Bool, Int
 from .._util.checks import all_finite
 from .._util.vec3 import Scalar
 from ..march.beams import Box, EmptySpaceIndex, Skips
+from ..ray import Scene
 from ..scene.camera import Camera, Ending, GivenRays, RaySubset
 from ..scene.occupancy import Occupancy
+from ..scene.rendering import Rendering
 from ..scene.space import Line, Ray, Space, enter
+from ..xla.differentiation import nan_derivatives
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree, unchecked
 from .tiling import GROUPS_OF_BEAM, Tiling
@@ -348,3 +351,16 @@ def enter_rays(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], se
     mapped = partial(jax.lax.map, jax.vmap(one), batch_size=searched) if space.searches else vmap_rays(one)
     ray = mapped(lines)
     return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))
+
+
+def over_tiles(
+    scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
+) -> tuple[Rendering, Any]:
+    """Calls `one(tile, rays)` for all tiles in sequence. Returns the image, and stacked second results."""
+    fault = scene.has_fault
+
+    def render_tile(inputs: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
+        return one(inputs[0], tiles.rays(scene.source, space, inputs[0], fault))
+
+    renderings, extra = tiles.map(render_tile)
+    return nan_derivatives(jax.tree.map(tiles.assemble, renderings), fault), extra

@@ -287,7 +287,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "ray samples: rays leap a cell too far",
-        "engine.ray_samples:leap_by_ray",
+        "engine.direct:leap_by_ray",
         a_cell_further,
         ("engine/test_ray_samples.py::test_sums_over_samples_are_the_image",),
     ),

@@ -1,19 +1,59 @@
-"""Collects the samples of rays, whose number is static, by a scan that JAX differentiates."""
+"""Images by a static number of reference steps along each ray, a scan that JAX differentiates; and their
+samples."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from ..march.beams import Box, EmptySpaceIndex
-from ..ray import Progress, Scene, Track, by_rules
-from ..scene.rendering import RaySamples
+from ..march.march import March
+from ..ray import Progress, Scene, Track, by_rules, end
+from ..reference import step, steps_across
+from ..scene.rendering import RaySamples, Rendering
 from ..scene.space import Ray
+from ..scene.volume import Volume
+from ..xla.compiling import compiled
+from ..xla.differentiation import nan_derivatives
+from ..xla.sharding import varying
 from ..xla.trees import PyTree
-from .tiling import Tiling
+from .acceleration import VolumeAcceleration, empty_space_of
+from .rays import RayTiles, over_tiles, vmap_rays
+from .shifts import begin_rays
+from .tiling import RenderOptions, Tiling
 from .wavefront import Job, to_next_cell
+
+
+def steps_of(volume: Volume, march: March) -> int:
+    """Number of steps for the longest ray: a multiple of 64, which few changes of step alter."""
+    return min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
+
+
+def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    """The image by `options.steps` steps along each ray; and, with `options.samples`, the samples of those
+    steps, which then do not lie in empty space."""
+    tiles = RayTiles.of(scene.source, options.tiling, direct=True)
+    scene = nan_derivatives(scene, scene.has_fault)
+    prepared = acceleration.prepared(scene)
+    index = empty_space_of(scene, acceleration, options.tiling) if options.samples else None
+
+    def scan_tile(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
+        one = vmap_rays(partial(step, prepared))
+        start = begin_rays(scene.march, prepared, rays, options.tiling, options.outputs, finds_shifts=False)
+        start = varying(start, rays)
+        if options.samples:
+            leap = leap_by_ray(prepared, options.tiling, index, rays, start.track)
+            at, samples = scan_samples(partial(one, rays), leap, rays, start, options.steps or 0)
+        else:
+            samples = None
+            at, _ = jax.lax.scan(lambda at, none: (one(rays, at)[0], none), start, None, length=options.steps)
+        rendering = vmap_rays(partial(end, prepared))(rays, at)
+        return replace(rendering, details=rendering.details._replace(ray_samples=samples)), None
+
+    return over_tiles(scene, prepared.space, tiles, scan_tile)[0]
 
 
 def scan_samples(
@@ -81,3 +121,6 @@ def leap_by_ray(
         return jax.tree.map(lambda leaf, like: leaf.reshape(like.shape), moved, at)
 
     return leap
+
+
+direct_image = compiled(scan_image, has_jvp=True)
