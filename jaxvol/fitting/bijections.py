@@ -20,6 +20,9 @@ from ..xla.trees import PyTree
 MARGIN = 1e-3
 """Minimum distance of a start from an open end, relative to the scale: the map is flat at the end."""
 
+REACH = 0.5
+"""Largest relative change of a value, far from 0, over which a function may be almost linear."""
+
 
 class RigidMotion(NamedTuple):
     """A rotation about a point, and a translation after it: p becomes R (p - center) + center + translation.
@@ -60,6 +63,10 @@ class Bijection(eqx.Module):
         """Part of a value that the free variables change."""
         return value
 
+    def reach(self, free: PyTree) -> PyTree:
+        """Largest change of the free variables over which a function of the value may be almost linear."""
+        return jax.tree.map(jnp.ones_like, free)
+
 
 class Fixed(Bijection):
     """Bijection without free variables: the value stays as it was at the start."""
@@ -84,6 +91,9 @@ class Unconstrained(Bijection):
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         return finite_array(name, value, (...,))
+
+    def reach(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return jnp.maximum(1, REACH * jnp.abs(free))
 
 
 class Positive(Bijection):
@@ -111,6 +121,9 @@ class Positive(Bijection):
         value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
         ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
         return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
+
+    def reach(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return jnp.maximum(1, REACH * free)  # below 0, free is a logarithm
 
 
 class UnitInterval(Bijection):

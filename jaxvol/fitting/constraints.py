@@ -62,6 +62,10 @@ class Free(eqx.Module):
         """Parts of the parameters that are fitted."""
         return [b.moved(b.forward(variables)) for b, variables in zip(self.bijections, free, strict=True)]
 
+    def reach(self, free: FreeVariables) -> FreeVariables:
+        """Largest change of the free variables over which a function may be almost linear."""
+        return tuple(b.reach(variables) for b, variables in zip(self.bijections, free, strict=True))
+
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []

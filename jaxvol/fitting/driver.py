@@ -147,10 +147,12 @@ def fit(
 
     Returns:
         A `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success` and `Fit.message` say so, and
-        the parameters are the best so far. A warning names directions that the residual does not
-        determine. If the noise of an `ImageResidual` is known, another warning says if the model does not
-        fit: noise exceeds its limit once in 741 fits, even if neighbouring pixels are correlated. Standard
-        errors don't cover the bias of such a fit. A fit of a `PathTracedResidual` only reports χ².
+        the parameters are the best so far. A warning names directions that the residual does not determine:
+        of a `PathTracedResidual`, also parameters that noise of its paths hides, by a standard error beyond
+        the longest step, such as a factor of e for numbers that are `Positive` and below the scale. If the
+        noise of an `ImageResidual` is known, another warning says if the model does not fit: noise exceeds
+        its limit once in 741 fits, even if neighbouring pixels are correlated. Standard errors don't cover
+        the bias of such a fit. A fit of a `PathTracedResidual` only reports χ².
 
     Raises:
         ValueError: for incompatible arguments, parameters that are not finite or out of bounds, a residual

@@ -39,9 +39,6 @@ from .uncertainty import spreads
 HELD = 8
 """Number of Jacobians in memory: by two halves of the paths, means over two epochs and both, and copies."""
 
-LONGEST = 1.0, 0.5
-"""Maximum change of a free variable in a step: the larger of the first number, and the second times it."""
-
 FLOOR = 0.3
 """Minimum curvature by one sample, relative to that with noise: the unbiased one may be 0 or negative."""
 
@@ -164,6 +161,10 @@ class SampledProblem(eqx.Module):
         """Norm of the references."""
         return self.residual.references.scale()
 
+    def reach(self, at: FreeVariables) -> FreeVariables:
+        """Maximum change of the free variables in a step."""
+        return self.free.reach(at)
+
     def sample(self, at: FreeVariables, step: Int[Array, ""]) -> Float[Array, "2 pixels 3 numbers"]:
         """[J r] of both halves of the paths at a point, by the random numbers of a step."""
         flat, unravel = ravel_pytree(at)
@@ -220,9 +221,15 @@ class Averages(eqx.Module):
         means = jax.tree.map(lambda a, b: a + (b - a) * (later.steps / steps), self, later)
         return replace(means, steps=steps)
 
-    @property
-    def minimum(self) -> tuple[Float[Array, " free"], Float[Array, "free free"], Float[Array, ""]]:
-        """Minimum of a quadratic model of the loss: the point, its covariance by the paths, the loss."""
+    def minimum(
+        self, reach: Float[Array, " free"]
+    ) -> tuple[Float[Array, " free"], Float[Array, "free free"], Float[Array, ""]]:
+        """Minimum of a quadratic model of the loss: the point, its covariance by the paths, the loss.
+
+        Steps from the mean point are damped: a single one is divided by 1 + variance / `reach`². Undamped,
+        noise would move a parameter that the samples do not show yet, such as a mean free path within an
+        opaque material, to where it has no effect.
+        """
         flat, halves = self.rows.reshape(-1, self.rows.shape[-1]), 2 * self.steps
         squares = flat.T @ flat
         # mean over all pairs of different halves of all steps
@@ -233,9 +240,11 @@ class Averages(eqx.Module):
         values, axes = jnp.linalg.eigh(curvature / jnp.outer(scale, scale))
         axes = axes / jnp.outer(scale, jnp.sqrt(jnp.maximum(values, FLOOR / jnp.sqrt(self.steps))))
         inverse = axes @ axes.T
-        covariance = inverse @ self.scatter[:-1, :-1] @ inverse / self.steps
-        loss = (pairs[-1, -1] - gradient @ inverse @ gradient) / 2
-        return self.point - inverse @ gradient, covariance, loss
+        step, covariance = inverse @ gradient, inverse @ self.scatter[:-1, :-1] @ inverse / self.steps
+        loss = (pairs[-1, -1] - gradient @ step) / 2
+        prior = jnp.diagonal(covariance) / (jnp.square(reach) * jnp.diagonal(inverse))
+        damped = jnp.linalg.solve(jnp.eye(len(step)) + inverse @ jnp.diag(prior), step)
+        return self.point - damped, covariance, loss
 
 
 class SampledRun(eqx.Module):
@@ -244,7 +253,7 @@ class SampledRun(eqx.Module):
     Attributes:
         best: the result so far, and the point of the next sample.
         evaluated: the point of the last sample.
-        cut: whether the step to `best` was shortened.
+        cut: whether the step to `best` was shortened, by its length or by more than half by its noise.
         count: number of samples so far.
         last: averages over the last epoch; of no steps at first.
         current: averages over the current epoch.
@@ -282,9 +291,10 @@ class SampledRun(eqx.Module):
         flat, unravel = ravel_pytree(self.best)
         current = self.current.joined(Averages.of(flat, self.cut, sample, known.rows, known.steps))
         window = self.last.joined(current)
-        point, covariance, loss = window.minimum
-        step, limit = point - flat, jnp.maximum(LONGEST[0], LONGEST[1] * jnp.abs(flat))
-        y, cut = unravel(flat + jnp.clip(step, -limit, limit)), jnp.any(jnp.abs(step) > limit)
+        reach, _ = ravel_pytree(problem.reach(self.best))
+        point, covariance, loss = window.minimum(reach)
+        step, vague = point - flat, jnp.any(jnp.diagonal(covariance) > jnp.square(reach))
+        y, cut = unravel(flat + jnp.clip(step, -reach, reach)), vague | jnp.any(jnp.abs(step) > reach)
         ended, none = current.steps >= FORGET * self.last.steps, jax.tree.map(jnp.zeros_like, current)
         last = jax.tree.map(lambda new, old: jnp.where(ended, new, old), current, self.last)
         current = jax.tree.map(lambda new, old: jnp.where(ended, new, old), none, current)
@@ -335,7 +345,10 @@ class SampledRun(eqx.Module):
         converged = result == Outcome.successful
         ended = "converged" if converged else "reached the maximum number of steps, max_steps"
         if not self.settled:
-            return f"The fit {ended}: some of its last steps were shortened, since the minimum is far away."
+            return (
+                f"The fit {ended}: some of its last steps were shortened, since the minimum is far away, or "
+                "noise of the paths hides it."
+            )
         return (
             f"The fit {ended}: noise of its own paths adds {self.ratio(problem, limits):.2g} times the "
             f"standard error due to noise of the references ({ENOUGH} is enough)."

@@ -111,6 +111,10 @@ def uncertainty(
     flat, unravel = ravel_pytree(at)
     jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
     unequal, equal, undetermined = spreads(triangles, count, scale)
+    if path_covariance is not None:
+        reach = np.asarray(ravel_pytree(free.reach(at))[0], np.float64)
+        hidden = np.diag(np.asarray(path_covariance, np.float64)) > reach**2
+        undetermined = np.concatenate([undetermined, np.eye(flat.size)[hidden]])
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
     # the parameter is undetermined

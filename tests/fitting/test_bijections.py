@@ -97,6 +97,13 @@ def test_values_out_of_bounds_are_named(case):
         bijection.inverse(value, "glow")
 
 
+def test_reach_is_a_factor_near_0_and_relative_far_away():
+    free = jnp.array([-8.0, 0.5, 8.0])
+    assert jv.Positive().reach(free).tolist() == [1, 1, 4]  # below 0, free is a logarithm
+    assert jv.Unconstrained().reach(free).tolist() == [4, 1, 4]
+    assert jv.UnitInterval().reach(free).tolist() == [1, 1, 1]
+
+
 def test_scale_must_be_positive():
     with pytest.raises(ValueError, match="scale must be greater than 0; got 0"):
         jv.Positive(0)
