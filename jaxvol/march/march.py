@@ -203,6 +203,7 @@ class CellRules(_Cells):
         opacity_left: transmittance at or below which rays end; negative: never.
         most_samples: of a ray.
         divide: cuts a cell at what lies within; None if nothing does.
+        may_divide: tests at less cost whether `divide` may cut a cell, by `Fetch.changes`; None: unknown.
         custom: transforms that override `KERNEL_SEAMS` and are no numbers. If there are any, all are here,
             and only `step`, `place` and `most_samples` count beside them.
     """
@@ -215,6 +216,7 @@ class CellRules(_Cells):
     integrates: bool = eqx.field(static=True)
     at_entry: bool = eqx.field(static=True, default=False)
     divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
+    may_divide: Callable[[Cell, Ray, Volume], Bool[Array, ""]] | None = eqx.field(static=True, default=None)
     custom: tuple[Transform, ...] = ()
 
     def overriding(self, seam: str) -> list[Transform]:

@@ -61,6 +61,8 @@ class Fetch(eqx.Module):
     """Whether node and fractions are stored in memory in forward-mode derivatives. Otherwise XLA recomputes
     them for each use, and may round a coordinate on a plane of nodes to either side, so that the fractions
     of one node are combined with the voxels of another. It takes 1 to 4 % of a gradient."""
+    changes: UInt32[Array, " nodes"] | None = eqx.field(default=None, kw_only=True)
+    """For each node, the directions in which labels change (`label_changes`), if known."""
 
     @abstractmethod
     def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: DType) -> Cube:
@@ -456,6 +458,12 @@ def flat_index(node: Node, shape: tuple[Any, ...]) -> Int[Array, "..."]:
     i, j, k = node
     _, ny, nz, *_ = shape
     return (i * ny + j) * nz + k
+
+
+def direction_bit(sides: Sequence[Any]) -> Any:
+    """The bit of `label_changes` for a direction, given by its sides along x, y, z: -1, 0 or 1."""
+    i, j, k = sides
+    return 13 + 9 * i + 3 * j + k
 
 
 def nearest_node(coordinate: Vec3, shape: tuple[Any, ...]) -> Node:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, cast
 
 import equinox as eqx
@@ -14,8 +15,8 @@ from ..._util.checks import Flag, flag
 from ..._util.vec3 import Scalar, Vec3, greatest, minus
 from ...scene.space import Path, Ray
 from ...scene.volume import Volume
-from ...scene.voxel_fetch import Node, flat_index, nearest_node
-from ...xla.memory import in_memory
+from ...scene.voxel_fetch import Node, direction_bit, flat_index, nearest_node
+from ...xla.memory import gather, in_memory
 from ..march import Cell, CellRules, Transform, cut_at_entry, cut_at_exit
 
 
@@ -67,7 +68,8 @@ class AlphaCorrection(Transform):
         return self._divide(cut_at_exit(cell, ray), ray, volume)
 
     def rules(self, rules: CellRules) -> CellRules:
-        return replace(rules, at_exit=np.asarray(True), divide=self._divide)
+        may_divide = _may_change if self.labels else None
+        return replace(rules, at_exit=np.asarray(True), divide=self._divide, may_divide=may_divide)
 
     @property
     def reads_labels(self) -> bool:
@@ -136,6 +138,27 @@ def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, 
         _face(cell, number, parts, ray.path, volume) for number in (crossed // LIMIT, crossed % LIMIT)
     )
     return first, last, crossed > 0
+
+
+def _may_change(cell: Cell, ray: Ray, volume: Volume) -> Bool[Array, ""]:
+    """True if `_divided_by_labels` may cut a cell, by the volume's `Fetch.changes`."""
+    words = volume.fetch.changes
+    assert words is not None
+    inner, path = jax.lax.stop_gradient((cut_at_entry(cell), ray.path))
+    parts, live = _parts(inner, path), volume.spacing[0] > 0
+
+    def search(part: Any, changes: Bool[Array, ""]) -> Bool[Array, ""]:
+        def steps() -> tuple[Int[Array, ""], Int[Array, ""]]:
+            crossings = _crossings(inner, part, parts, path, volume)
+            return flat_index(crossings.node, volume.shape), direction_bit(crossings.sides)
+
+        # kernels of their own, as in `_labels_behind`
+        place, bit = in_memory(live, steps)
+        word = in_memory(live, partial(gather, words), place)
+        return changes | (word >> bit.astype(word.dtype) & 1 == 1)
+
+    changes = jax.lax.fori_loop(0, parts, search, jnp.zeros(cell.front.shape, bool))
+    return changes | _gap_faces(cell, ray)[2] if ray.gaps else changes
 
 
 def _parts(cell: Cell, path: Path) -> Int[Array, ""]:

@@ -1,0 +1,98 @@
+"""Merges the pieces of each cell to one part of its ray. Few cells are divided by faces of labels: these are
+gathered in chunks, and only their pieces are sampled."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from .._util.vec3 import Color, Scalar
+from ..compositing.blending import Composite, Over, joined
+from ..march.march import Cell, CellRules
+from ..ray import Progress, SampleStats, Scene, add, measure, opacity, transmittance
+from ..scene.space import Ray
+from ..scene.transfer import Measured
+from ..xla.compaction import Chosen
+from ..xla.memory import in_memory
+from ..xla.trees import unchecked, with_fields
+from .rays import vmap_cells
+
+
+CHUNK = 1024
+"""Divided cells that are sampled at a time."""
+
+
+class Part(NamedTuple):
+    """What a cell adds to its ray: composite and statistics of its pieces alone."""
+
+    composite: Composite
+    stats: SampleStats | None
+
+
+def merges(scene: Scene, chunk: int) -> bool:
+    """True if pieces can be merged, under "over" without light, and it is known where cells may be divided.
+    `chunk`: `Tiling.chunk`."""
+    rules, mode, fetch = scene.march, scene.compositing, scene.volume.fetch
+    tests = isinstance(rules, CellRules) and rules.may_divide is not None and not rules.custom
+    known = chunk > 0 and fetch.changes is not None
+    return tests and known and type(mode) is Over and scene.classification.light is None
+
+
+def merged(
+    scene: Scene,
+    live: Bool[Array, ""],
+    ray: Ray,
+    at: Progress,
+    cell: Cell,
+    measured: Measured,
+    color: Color,
+    alpha: Scalar,
+) -> Part:
+    """The parts of cells (cells, rays), from samples of undivided ones. `live`: as for `in_memory`."""
+    rules, volume = scene.march, scene.volume
+    assert isinstance(rules, CellRules)
+    may_divide, divide = rules.may_divide, rules.divide
+    assert may_divide is not None
+    assert divide is not None
+
+    def part(ray: Ray, *pieces: tuple[Cell, Measured, Color, Scalar]) -> Part:
+        zero = jax.tree.map(lambda leaf: jnp.zeros((), leaf.dtype), Part(at.composite, at.stats))
+        alone = unchecked(Progress, **zero._asdict(), index=None, track=None, finished=jnp.zeros((), bool))
+        for piece in pieces:
+            alone = add(scene, ray, alone, *piece, divided=True)
+        return Part(alone.composite, alone.stats)
+
+    def divided(ray: Ray, cell: Cell) -> Bool[Array, ""]:
+        return (cell.width > 0) & (cell.front < ray.end) & may_divide(cell, ray, volume)
+
+    chosen = Chosen.of([vmap_cells(divided, (False, True))(ray, cell)], CHUNK)
+
+    def sampled(indices: Int[Array, " chunk"], parts: Part) -> Part:
+        column = indices % chosen.columns
+        rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), ray)
+        cells = chosen.take([cell], indices)
+        pieces = in_memory(live, jax.vmap(partial(divide, volume=volume)), cells, rays)
+        of_pieces = jax.vmap(partial(measure, scene))
+        values = in_memory(live, lambda: [of_pieces(rays, piece) for piece in pieces])
+
+        def one(ray: Ray, pieces: tuple[Cell, ...], values: list[Measured]) -> Part:
+            colors = (scene.classification.of_cells(measured)[0] for measured in values)
+            alphas = (opacity(scene, ray, *pair) for pair in zip(pieces, values, strict=True))
+            return part(ray, *zip(pieces, (value[:1] for value in values), colors, alphas, strict=True))
+
+        return chosen.put(parts, indices, in_memory(live, jax.vmap(one), rays, pieces, values))
+
+    whole = vmap_cells(part, (False, True))(ray, (cell, measured[:1], color, alpha))
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1), whole)
+    return chosen.split(chosen.fold(sampled, flat), 1)[0]
+
+
+def join(scene: Scene, at: Progress, part: Part) -> Progress:
+    """Composites the next cell of a ray, unless it is finished."""
+    composite, stats = jax.tree.map(lambda leaf: jnp.where(at.finished, jnp.zeros_like(leaf), leaf), part)
+    if at.stats is not None:
+        shows = stats.aligned & (transmittance(scene, at.composite) > 0)
+        stats = SampleStats(at.stats.samples + stats.samples, at.stats.aligned | shows)
+    return with_fields(at, composite=joined(at.composite, composite), stats=stats)
