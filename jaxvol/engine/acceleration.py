@@ -310,7 +310,10 @@ def label_changes(labels: Any, xp: Any) -> Any:
     return words.reshape(-1)
 
 
-_label_changes, _label_changes_in_numpy = jax.jit(partial(label_changes, xp=jnp)), partial(label_changes, xp=np)
+_label_changes, _label_changes_in_numpy = (
+    jax.jit(partial(label_changes, xp=jnp)),
+    partial(label_changes, xp=np),
+)
 
 
 def shared_length(voxels: int) -> int:

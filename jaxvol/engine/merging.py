@@ -16,12 +16,15 @@ from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
-from ..xla.trees import unchecked, with_fields
+from ..xla.trees import with_fields
 from .rays import vmap_cells
 
 
 CHUNK = 1024
 """Divided cells that are sampled at a time."""
+
+ROW = 32
+"""Cells that are counted by one product."""
 
 
 class Part(NamedTuple):
@@ -53,27 +56,33 @@ def merged(
     """The parts of cells (cells, rays), from samples of undivided ones. `live`: as for `in_memory`."""
     rules, volume = scene.march, scene.volume
     assert isinstance(rules, CellRules)
-    may_divide, divide = rules.may_divide, rules.divide
-    assert may_divide is not None
+    test, divide = rules.may_divide, rules.divide
+    assert test is not None
     assert divide is not None
 
     def part(ray: Ray, *pieces: tuple[Cell, Measured, Color, Scalar]) -> Part:
-        zero = jax.tree.map(lambda leaf: jnp.zeros((), leaf.dtype), Part(at.composite, at.stats))
-        alone = unchecked(Progress, **zero._asdict(), index=None, track=None, finished=jnp.zeros((), bool))
+        alone = jax.tree.map(lambda leaf: jnp.zeros((), leaf.dtype), at)
         for piece in pieces:
             alone = add(scene, ray, alone, *piece, divided=True)
         return Part(alone.composite, alone.stats)
 
-    def divided(ray: Ray, cell: Cell) -> Bool[Array, ""]:
-        return (cell.width > 0) & (cell.front < ray.end) & may_divide(cell, ray, volume)
+    # as many parts for all cells, since a loop of one length is faster
+    parts = jnp.max(vmap_cells(test.parts, (True, False))(cell, ray).astype(jnp.float32)).astype(jnp.int32)
 
-    chosen = Chosen.of([vmap_cells(divided, (False, True))(ray, cell)], CHUNK)
+    def tested(number: Int[Array, ""], divided: Bool[Array, "cells rays"]) -> Bool[Array, "cells rays"]:
+        def one(cell: Cell, ray: Ray) -> Bool[Array, ""]:
+            return test.part(cell, ray, volume, number, parts)
+
+        return divided | vmap_cells(one, (True, False))(cell, ray)
+
+    divided = jax.lax.fori_loop(0, parts, tested, jnp.zeros(cell.front.shape, bool))
+    chosen = Chosen.of([divided & (cell.width > 0) & (cell.front < ray.end[None])], CHUNK, ROW)
 
     def sampled(indices: Int[Array, " chunk"], parts: Part) -> Part:
         column = indices % chosen.columns
         rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), ray)
         cells = chosen.take([cell], indices)
-        pieces = in_memory(live, jax.vmap(partial(divide, volume=volume)), cells, rays)
+        pieces = in_memory(live, jax.vmap(lambda *one: divide(*one, volume)), cells, rays)
         of_pieces = jax.vmap(partial(measure, scene))
         values = in_memory(live, lambda: [of_pieces(rays, piece) for piece in pieces])
 

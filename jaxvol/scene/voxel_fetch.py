@@ -502,14 +502,18 @@ def _below(coordinate: Scalar, n: Any, bounded: bool) -> tuple[Int[Array, "..."]
     inside = jnp.where(coordinate < 0, 0, jnp.where(coordinate > last + 1, last + 1, coordinate))
     node = jax.lax.stop_gradient(jnp.floor(inside))
     node = jnp.where(node > last, last, node)
-    if dtype == jnp.float32 and not (isinstance(n, int) and n > SMALL):
-        # the last 23 bits: half as many instructions as XLA's conversion, which handles all numbers
-        index = jax.lax.bitcast_convert_type(node + 2.0**23, jnp.int32) & (2**23 - 1)
-    else:
-        index = node.astype(jnp.int32)
+    index = to_index(node, n)
     if bounded:  # also the node of NaN
         index = jnp.clip(index, 0, jnp.asarray(n - 2, jnp.int32))
     return index, inside - node
+
+
+def to_index(node: Scalar, n: Any) -> Int[Array, "..."]:
+    """The integer of a float from 0 to `n`; any for NaN."""
+    if node.dtype == jnp.float32 and not (isinstance(n, int) and n > SMALL):
+        # the last 23 bits: half as many instructions as XLA's conversion, which handles all numbers
+        return jax.lax.bitcast_convert_type(node + 2.0**23, jnp.int32) & (2**23 - 1)
+    return node.astype(jnp.int32)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
