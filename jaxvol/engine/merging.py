@@ -16,6 +16,7 @@ from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
+from ..xla.sharding import varying
 from ..xla.trees import with_fields
 from .rays import vmap_cells
 
@@ -67,22 +68,26 @@ def merged(
         return Part(alone.composite, alone.stats)
 
     # as many parts for all cells, since a loop of one length is faster
-    parts = jnp.max(vmap_cells(test.parts, (True, False))(cell, ray).astype(jnp.float32)).astype(jnp.int32)
+    most = jnp.max(vmap_cells(test.parts, (True, False))(cell, ray).astype(jnp.float32)).astype(jnp.int32)
 
     def tested(number: Int[Array, ""], divided: Bool[Array, "cells rays"]) -> Bool[Array, "cells rays"]:
         def one(cell: Cell, ray: Ray) -> Bool[Array, ""]:
-            return test.part(cell, ray, volume, number, parts)
+            return test.part(cell, ray, volume, number, most)
 
         return divided | vmap_cells(one, (True, False))(cell, ray)
 
-    divided = jax.lax.fori_loop(0, parts, tested, jnp.zeros(cell.front.shape, bool))
+    none = varying(jnp.zeros(cell.front.shape, bool), cell)
+    divided = jax.lax.fori_loop(0, most, tested, none)
     chosen = Chosen.of([divided & (cell.width > 0) & (cell.front < ray.end[None])], CHUNK, ROW)
+
+    def pieces_of(cell: Cell, ray: Ray) -> tuple[Cell, ...]:
+        return divide(cell, ray, volume)
 
     def sampled(indices: Int[Array, " chunk"], parts: Part) -> Part:
         column = indices % chosen.columns
         rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), ray)
         cells = chosen.take([cell], indices)
-        pieces = in_memory(live, jax.vmap(lambda *one: divide(*one, volume)), cells, rays)
+        pieces = in_memory(live, jax.vmap(pieces_of), cells, rays)
         of_pieces = jax.vmap(partial(measure, scene))
         values = in_memory(live, lambda: [of_pieces(rays, piece) for piece in pieces])
 

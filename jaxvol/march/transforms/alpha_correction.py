@@ -41,9 +41,10 @@ class AlphaCorrection(Transform):
     Args:
         labels: also cut cells at the first and the last plane, half-way between nodes, where the label of the
             nearest node changes, so that the faces of a segmentation stay smooth under jitter. What lies
-            between two labels of one cell has the label behind the first face. Costs four label fetches per
-            cell of up to a voxel, and two more samples: a frame takes 3 to 5 times as long. Gradients include
-            the motion of exit and faces.
+            between two labels of one cell has the label behind the first face. A frame takes about 1.5 to
+            2 times as long, and four bytes per label, computed once; 3 to 5 times as long with lighting,
+            under other modes than "over", on GPUs, and where labels are traced. Gradients include the motion
+            of exit and faces.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
