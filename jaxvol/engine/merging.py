@@ -29,7 +29,7 @@ ROW = 32
 
 
 class Part(NamedTuple):
-    """What a cell adds to its ray: composite and statistics of its pieces alone."""
+    """Contribution of a cell to its ray: composite and statistics of its pieces alone."""
 
     composite: Composite
     stats: SampleStats | None
