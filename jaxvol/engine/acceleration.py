@@ -66,7 +66,7 @@ class VolumeAcceleration(eqx.Module):
     """Occupancy with distances, in place of `blocks`, for distances of finer blocks without traced arrays:
     computed once per volume and transfer function."""
     changes: UInt32[Array, " nodes"] | None = None
-    """`label_changes` of the volume's labels, where cells are cut at their faces."""
+    """`changes_of` the volume's labels, where cells are cut at their faces."""
 
     @classmethod
     def of(
@@ -285,17 +285,17 @@ def with_words(
 
 
 def changes_of(volume: Volume) -> UInt32[Array, " nodes"] | None:
-    """`label_changes` of a volume, on a CPU. None for labels that are traced, if there are none, or if the
-    words would take too much memory."""
+    """Words of `_label_changes`, on a CPU. None for labels that are traced, if there are none, or if the words
+    would take too much memory."""
     labels = volume.labels
     if not isinstance(labels, jax.Array) or is_traced(labels) or platform() != "cpu":
         return None
     if 4 * labels.size > LIMIT or volume.first is not None:
         return None
-    return memoized(labels, _label_changes, _label_changes_in_numpy)
+    return memoized(labels, _changes_by_jax, _changes_in_numpy)
 
 
-def label_changes(labels: Any, xp: Any) -> Any:
+def _label_changes(labels: Any, xp: Any) -> Any:
     """Words of 27 bits, one for each direction from a node to a neighbour (`direction_bit`): whether the
     nodes of the box between the two, of 2, 4 or 8 nodes, have several labels. The bits of directions that
     leave the grid are arbitrary. `xp`: `numpy` or `jax.numpy`."""
@@ -310,9 +310,9 @@ def label_changes(labels: Any, xp: Any) -> Any:
     return words.reshape(-1)
 
 
-_label_changes, _label_changes_in_numpy = (
-    jax.jit(partial(label_changes, xp=jnp)),
-    partial(label_changes, xp=np),
+_changes_by_jax, _changes_in_numpy = (
+    jax.jit(partial(_label_changes, xp=jnp)),
+    partial(_label_changes, xp=np),
 )
 
 

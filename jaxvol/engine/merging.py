@@ -62,22 +62,22 @@ def merged(
     assert divide is not None
 
     def part(ray: Ray, *pieces: tuple[Cell, Measured, Color, Scalar]) -> Part:
-        alone = jax.tree.map(lambda leaf: jnp.zeros((), leaf.dtype), at)
+        added = jax.tree.map(lambda leaf: jnp.zeros((), leaf.dtype), at)
         for piece in pieces:
-            alone = add(scene, ray, alone, *piece, divided=True)
-        return Part(alone.composite, alone.stats)
+            added = add(scene, ray, added, *piece, divided=True)
+        return Part(added.composite, added.stats)
 
     # as many parts for all cells, since a loop of one length is faster
-    most = jnp.max(vmap_cells(test.parts, (True, False))(cell, ray).astype(jnp.float32)).astype(jnp.int32)
+    count = jnp.max(vmap_cells(test.parts, (True, False))(cell, ray).astype(jnp.float32)).astype(jnp.int32)
 
     def tested(number: Int[Array, ""], divided: Bool[Array, "cells rays"]) -> Bool[Array, "cells rays"]:
         def one(cell: Cell, ray: Ray) -> Bool[Array, ""]:
-            return test.part(cell, ray, volume, number, most)
+            return test.part(cell, ray, volume, number, count)
 
         return divided | vmap_cells(one, (True, False))(cell, ray)
 
-    none = varying(jnp.zeros(cell.front.shape, bool), cell)
-    divided = jax.lax.fori_loop(0, most, tested, none)
+    start = varying(jnp.zeros(cell.front.shape, bool), cell)
+    divided = jax.lax.fori_loop(0, count, tested, start)
     chosen = Chosen.of([divided & (cell.width > 0) & (cell.front < ray.end[None])], CHUNK, ROW)
 
     def pieces_of(cell: Cell, ray: Ray) -> tuple[Cell, ...]:
@@ -98,8 +98,8 @@ def merged(
 
         return chosen.put(parts, indices, in_memory(live, jax.vmap(one), rays, pieces, values))
 
-    whole = vmap_cells(part, (False, True))(ray, (cell, measured[:1], color, alpha))
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1), whole)
+    undivided = vmap_cells(part, (False, True))(ray, (cell, measured[:1], color, alpha))
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1), undivided)
     return chosen.split(chosen.fold(sampled, flat), 1)[0]
 
 

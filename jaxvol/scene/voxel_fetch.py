@@ -62,7 +62,7 @@ class Fetch(eqx.Module):
     them for each use, and may round a coordinate on a plane of nodes to either side, so that the fractions
     of one node are combined with the voxels of another. It takes 1 to 4 % of a gradient."""
     changes: UInt32[Array, " nodes"] | None = eqx.field(default=None, kw_only=True)
-    """For each node, the directions in which labels change (`label_changes`), if known."""
+    """Directions from each node in which labels change (`engine.acceleration.changes_of`), if known."""
 
     @abstractmethod
     def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: DType) -> Cube:
@@ -461,7 +461,7 @@ def flat_index(node: Node, shape: tuple[Any, ...]) -> Int[Array, "..."]:
 
 
 def direction_bit(sides: Sequence[Any]) -> Any:
-    """The bit of `label_changes` for a direction, given by its sides along x, y, z: -1, 0 or 1."""
+    """The bit of `Fetch.changes` for a direction, given by its sides along x, y, z: -1, 0 or 1."""
     i, j, k = sides
     return 13 + 9 * i + 3 * j + k
 
@@ -508,7 +508,7 @@ def _below(coordinate: Scalar, n: Any, bounded: bool) -> tuple[Int[Array, "..."]
     return index, inside - node
 
 
-def to_index(node: Scalar, n: Any) -> Int[Array, "..."]:
+def to_index(node: Scalar, n: int | np.integer | Array) -> Int[Array, "..."]:
     """The integer of a float from 0 to `n`; any for NaN."""
     if node.dtype == jnp.float32 and not (isinstance(n, int) and n > SMALL):
         # the last 23 bits: half as many instructions as XLA's conversion, which handles all numbers
