@@ -32,11 +32,11 @@ from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
 from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume, grids, read_as
-from ..scene.voxel_fetch import SLOPE_BITS, Packed
+from ..scene.voxel_fetch import SLOPE_BITS, Packed, direction_bit
 from ..xla.memo import memoized, memoized_of
 from ..xla.memory import zeros_in_reserve
 from ..xla.platform import is_traced, platform
-from ..xla.trees import constant, unchecked
+from ..xla.trees import constant, unchecked, with_fields
 from .rays import RayTiles, lines, vmap_rays
 from .shifts import begin_rays
 from .tiling import Tiling
@@ -65,6 +65,8 @@ class VolumeAcceleration(eqx.Module):
     occupancy: Occupancy | None = None
     """Occupancy with distances, in place of `blocks`, for distances of finer blocks without traced arrays:
     computed once per volume and transfer function."""
+    changes: UInt32[Array, " nodes"] | None = None
+    """`changes_of` the volume's labels, where cells are cut at their faces."""
 
     @classmethod
     def of(
@@ -87,6 +89,7 @@ class VolumeAcceleration(eqx.Module):
             [slopes_of(grid) if slopes else None for grid in grids(volume)],
             _blocks_of(volume, transfer, march) if march.leaps and occupancy is None else None,
             occupancy,
+            changes_of(volume) if march.reads_labels else None,
         )
 
     @property
@@ -96,7 +99,11 @@ class VolumeAcceleration(eqx.Module):
 
     def packed(self, scene: Scene) -> Scene:
         """The scene, fetching voxels from their packed copy."""
-        return scene._replace(volume=with_words(scene.volume, self.words, self.slopes))
+        volume = with_words(scene.volume, self.words, self.slopes)
+        if self.changes is not None:
+            fetch = with_fields(volume.fetch, changes=self.changes)
+            volume = with_fields(volume, fetch=fetch)
+        return scene._replace(volume=volume)
 
     def prepared(self, scene: Scene) -> Scene:
         """The packed scene, prepared for an image."""
@@ -254,7 +261,7 @@ def unshaped(volume: Volume) -> Volume:
     elif volume.field is None and fetch.window is None and data.ndim == 3 and data.dtype.kind == "f":
         if platform() != "cpu" or data.nbytes > LIMIT:
             return volume
-        fetch = Packed(memoized(data, _in_a_row, _in_a_row_in_numpy))
+        fetch = Packed(memoized(data, _in_a_row, _in_a_row_in_numpy), changes=fetch.changes)
     else:
         return volume
     sizes = np.asarray(data.shape, np.int32)
@@ -275,6 +282,38 @@ def with_words(
         return volume
     pairs = zip(words, [None] * len(words) if slopes is None else slopes, strict=True)
     return read_as(volume, *(None if word is None else Packed(word, slope) for word, slope in pairs))
+
+
+def changes_of(volume: Volume) -> UInt32[Array, " nodes"] | None:
+    """Words of `_label_changes`, on a CPU. None for labels that are traced, if there are none, or if the words
+    would take too much memory."""
+    labels = volume.labels
+    if not isinstance(labels, jax.Array) or is_traced(labels) or platform() != "cpu":
+        return None
+    if 4 * labels.size > LIMIT or volume.first is not None:
+        return None
+    return memoized(labels, _changes_by_jax, _changes_in_numpy)
+
+
+def _label_changes(labels: Any, xp: Any) -> Any:
+    """Words of 27 bits, one for each direction from a node to a neighbour (`direction_bit`): whether the
+    nodes of the box between the two, of 2, 4 or 8 nodes, have several labels. The bits of directions that
+    leave the grid are arbitrary. `xp`: `numpy` or `jax.numpy`."""
+    words, known = xp.zeros(labels.shape, np.uint32), 1 << direction_bit((0, 0, 0))
+    for axis, step in enumerate((9, 3, 1)):
+        parts = [words]
+        for side in (-1, 1):
+            differs = (xp.roll(labels, -side, axis) != labels).astype(np.uint32) * np.uint32(known)
+            box = words | xp.roll(words, -side, axis) | differs
+            parts.append(box << np.uint32(step) if side > 0 else box >> np.uint32(step))
+        words, known = parts[0] | parts[1] | parts[2], known | known << step | known >> step
+    return words.reshape(-1)
+
+
+_changes_by_jax, _changes_in_numpy = (
+    jax.jit(partial(_label_changes, xp=jnp)),
+    partial(_label_changes, xp=np),
+)
 
 
 def shared_length(voxels: int) -> int:

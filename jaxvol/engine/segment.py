@@ -8,8 +8,9 @@ CPU.)
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -26,6 +27,7 @@ from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree, unchecked, with_fields
+from .merging import Part, join, merged, merges
 from .rays import vmap_cells
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
@@ -118,13 +120,15 @@ class Place(eqx.Module):
 
 
 def march_segment(
-    scene: Scene, tiling: Tiling, rays: Ray, at: Progress, *, shifts: bool = False
+    scene: Scene, tiling: Tiling, rays: Ray, at: Progress, *, shifts: bool = False, visited: bool = False
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment of cells: by fewer where a ray has fewer left, by none where it is finished.
-    `shifts`: a segment is one cell, behind which rays may shift."""
+    `shifts`: a segment is one cell, behind which rays may shift. `visited`: all pieces are returned."""
     classification, number = scene.classification, tiling.cells
-    ahead = Ahead.of(rays, at, scene.march)
-    samples = _sampled(scene, number, ahead)
+    ahead, rules = Ahead.of(rays, at, scene.march), cast(Any, scene.march)
+    merging = not visited and merges(scene, tiling.chunk)
+    undivided = scene._replace(march=replace(rules, divide=None)) if merging else scene
+    samples = _sampled(undivided, number, ahead)
     ray, _ = ahead.place
     colors: Any
     values = [measured[:1] for measured in samples.measured]
@@ -138,15 +142,19 @@ def march_segment(
         colors = lit_colors(shader, scene, ray, *parts)
     else:
         colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
-    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+    cells: Any = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+    if merging:
+        cells = merged(scene, opaque_true(at), ray, at, *cells[0])
+        samples = samples._replace(opacity=[cells.composite.opacity])
     # Except for custom transforms, `finished` follows from the composite. So it is not carried from cell to
     # cell: XLA would compute the cells one after the other.
-    rules: Any = scene.march
     follows = isinstance(scene.compositing, Weighting) and not rules.custom
 
     def composite(ray: Ray, at: Progress, cell: PyTree, number: Int[Array, ""]) -> Progress:
         if follows:
             at = with_fields(at, finished=stopped(scene, at.composite))
+        if isinstance(cell, Part):
+            return join(scene, at, cell)
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
         at = reweigh(scene, ray, at, [piece[-1] for piece in cell], number)

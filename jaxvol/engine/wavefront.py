@@ -250,7 +250,8 @@ def _march_batch(
     def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
         lanes, total = state
         at = to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
-        after, samples = march_segment(job.scene, tiling, rays, at, shifts=job.shifts)
+        visited = job.visitor is not None
+        after, samples = march_segment(job.scene, tiling, rays, at, shifts=job.shifts, visited=visited)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
             carry, terms, total = job.visitor.visit(samples.ray, at, samples, constants, carry, total)

@@ -9,7 +9,7 @@ the last may reach past the exit. A transform is one idea of one paper: it overr
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, SupportsIndex, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, SupportsIndex, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -37,6 +37,18 @@ class Cell(eqx.Module):
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
+
+
+class DivisionTest(NamedTuple):
+    """A test, at little cost, whether `CellRules.divide` may cut a cell, by `Fetch.changes`.
+
+    Attributes:
+        parts: number of parts of a cell to be tested. More parts are tested, too, if others need them.
+        part: tests a part, (cell, ray, volume, number of the part, number of parts).
+    """
+
+    parts: Callable[[Cell, Ray], Int[Array, ""]]
+    part: Callable[[Cell, Ray, Volume, Int[Array, ""], Int[Array, ""]], Bool[Array, ""]]
 
 
 class Transform(eqx.Module):
@@ -203,6 +215,7 @@ class CellRules(_Cells):
         opacity_left: transmittance at or below which rays end; negative: never.
         most_samples: of a ray.
         divide: cuts a cell at what lies within; None if nothing does.
+        may_divide: tests whether `divide` may cut a cell; None: unknown.
         custom: transforms that override `KERNEL_SEAMS` and are no numbers. If there are any, all are here,
             and only `step`, `place` and `most_samples` count beside them.
     """
@@ -215,6 +228,7 @@ class CellRules(_Cells):
     integrates: bool = eqx.field(static=True)
     at_entry: bool = eqx.field(static=True, default=False)
     divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
+    may_divide: DivisionTest | None = eqx.field(static=True, default=None)
     custom: tuple[Transform, ...] = ()
 
     def overriding(self, seam: str) -> list[Transform]:

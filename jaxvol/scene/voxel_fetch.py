@@ -61,6 +61,8 @@ class Fetch(eqx.Module):
     """Whether node and fractions are stored in memory in forward-mode derivatives. Otherwise XLA recomputes
     them for each use, and may round a coordinate on a plane of nodes to either side, so that the fractions
     of one node are combined with the voxels of another. It takes 1 to 4 % of a gradient."""
+    changes: UInt32[Array, " nodes"] | None = eqx.field(default=None, kw_only=True)
+    """Directions from each node in which labels change (`engine.acceleration.changes_of`), if known."""
 
     @abstractmethod
     def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: DType) -> Cube:
@@ -458,6 +460,12 @@ def flat_index(node: Node, shape: tuple[Any, ...]) -> Int[Array, "..."]:
     return (i * ny + j) * nz + k
 
 
+def direction_bit(sides: Sequence[Any]) -> Any:
+    """The bit of `Fetch.changes` for a direction, given by its sides along x, y, z: -1, 0 or 1."""
+    i, j, k = sides
+    return 13 + 9 * i + 3 * j + k
+
+
 def nearest_node(coordinate: Vec3, shape: tuple[Any, ...]) -> Node:
     """The node nearest to a coordinate; the upper one of two equally near."""
     nearest = (jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate)
@@ -494,14 +502,18 @@ def _below(coordinate: Scalar, n: Any, bounded: bool) -> tuple[Int[Array, "..."]
     inside = jnp.where(coordinate < 0, 0, jnp.where(coordinate > last + 1, last + 1, coordinate))
     node = jax.lax.stop_gradient(jnp.floor(inside))
     node = jnp.where(node > last, last, node)
-    if dtype == jnp.float32 and not (isinstance(n, int) and n > SMALL):
-        # the last 23 bits: half as many instructions as XLA's conversion, which handles all numbers
-        index = jax.lax.bitcast_convert_type(node + 2.0**23, jnp.int32) & (2**23 - 1)
-    else:
-        index = node.astype(jnp.int32)
+    index = to_index(node, n)
     if bounded:  # also the node of NaN
         index = jnp.clip(index, 0, jnp.asarray(n - 2, jnp.int32))
     return index, inside - node
+
+
+def to_index(node: Scalar, n: int | np.integer | Array) -> Int[Array, "..."]:
+    """The integer of a float from 0 to `n`; any for NaN."""
+    if node.dtype == jnp.float32 and not (isinstance(n, int) and n > SMALL):
+        # the last 23 bits: half as many instructions as XLA's conversion, which handles all numbers
+        return jax.lax.bitcast_convert_type(node + 2.0**23, jnp.int32) & (2**23 - 1)
+    return node.astype(jnp.int32)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))

@@ -12,7 +12,7 @@ from .trees import PyTree
 
 
 CHUNK = 2048  # entries processed at a time by default
-ROW = 128  # entries that are counted by one product
+ROW = 128  # entries that are counted by one product by default
 
 
 class Chosen(NamedTuple):
@@ -31,11 +31,11 @@ class Chosen(NamedTuple):
     chunk: int
 
     @classmethod
-    def of(cls, chosen: list[Bool[Array, "rows columns"]], chunk: int = CHUNK) -> "Chosen":
-        """The entries where the masks are true."""
+    def of(cls, chosen: list[Bool[Array, "rows columns"]], chunk: int = CHUNK, row: int = ROW) -> "Chosen":
+        """The entries where the masks are true. `row`: as for `in_front`."""
         stacked = jnp.concatenate(chosen)
         number, flat = jnp.sum(stacked, dtype=jnp.int32), stacked.reshape(-1)
-        indices = in_front(flat, chunk) if chunk > 0 else in_place(flat)
+        indices = in_front(flat, chunk, row) if chunk > 0 else in_place(flat)
         return cls(indices, number, stacked.shape[1], chunk)
 
     def fold(self, step: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
@@ -69,13 +69,14 @@ class Chosen(NamedTuple):
         return [jax.tree.unflatten(tree, part) for part in zip(*parts, strict=True)]
 
 
-def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, " padded"]:
+def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK, row: int = ROW) -> Int[Array, " padded"]:
     """Indices of the chosen entries, in order, then indices past the end, up to a multiple of `chunk` (itself
-    a multiple of 128). Counts by products with a triangular matrix are faster than `jnp.nonzero`."""
+    a multiple of 128). Counts by products with a triangular matrix are faster than `jnp.nonzero`. `row`:
+    entries that are counted by one product."""
     padded = jnp.pad(chosen, (0, -chosen.size % chunk))
     last = padded.size
     # exact: numbers of entries are below 2²⁴
-    rank = _sums_before(padded.astype(jnp.float32)).astype(jnp.int32)
+    rank = _sums_before(padded.astype(jnp.float32), row).astype(jnp.int32)
     return (
         jnp.full(last, chosen.size, jnp.int32)
         .at[jnp.where(padded, rank, last)]
@@ -88,12 +89,12 @@ def in_place(chosen: Bool[Array, " entries"]) -> Int[Array, " entries"]:
     return jnp.where(chosen, jnp.arange(chosen.size, dtype=jnp.int32), chosen.size)
 
 
-def _sums_before(counts: Float[Array, " entries"]) -> Float[Array, " entries"]:
+def _sums_before(counts: Float[Array, " entries"], row: int = ROW) -> Float[Array, " entries"]:
     """Exclusive prefix sums."""
-    rows = jnp.pad(counts, (0, -counts.size % ROW)).reshape(-1, ROW)
-    entry = jnp.arange(ROW)
+    rows = jnp.pad(counts, (0, -counts.size % row)).reshape(-1, row)
+    entry = jnp.arange(row)
     earlier = (entry[:, None] < entry[None]).astype(counts.dtype)
     before = jnp.matmul(rows, earlier, precision=jax.lax.Precision.HIGHEST)
     if rows.shape[0] > 1:
-        before = before + _sums_before(jnp.sum(rows, axis=1))[:, None]
+        before = before + _sums_before(jnp.sum(rows, axis=1), row)[:, None]
     return before.reshape(-1)[: counts.size]

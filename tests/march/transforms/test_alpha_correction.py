@@ -3,6 +3,7 @@ what becomes of images.)"""
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
+from jaxvol.engine.acceleration import changes_of
 from jaxvol.march.march import Cell
 from jaxvol.scene.space import Affine, Ray, Straight, enter
 
@@ -110,9 +112,11 @@ def test_faces_of_labels_are_exact_and_move():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = random.uniform(2, 6, (number, 3)) - 20 * directions
 
+    # made outside of the program, where labels are known, so that pieces are merged
+    volume = jv.Volume(np.ones(shape, np.float32), labels=labels)
+
     @jax.jit
     def opacity_and_gradient(step, origins):
-        volume = jv.Volume(np.ones(shape, np.float32), labels=labels)
         transfer = jv.LabelTransferFunction([uniform_transfer(extinction) for extinction in extinctions])
         march = jv.March(step, (jv.AlphaCorrection(labels=True),), max_samples=64)
 
@@ -135,6 +139,37 @@ def test_faces_of_labels_are_exact_and_move():
         right = np.abs(found - exact(origins)) < 1e-5
         assert right.mean() >= share
         np.testing.assert_allclose(gradient[right], np.stack(slopes, 1)[right], atol=2e-3, rtol=2e-3)
+
+
+@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
+def test_merged_pieces_show_what_single_ones_do(quadrature):
+    """All outputs and a derivative in forward mode; pieces are single where labels are traced."""
+    random, shape = np.random.default_rng(1), (12, 11, 13)
+    labels = random.integers(0, 4, shape).astype(np.uint8)
+    labels[4:9, 3:8, 2:9] = 1
+    volume = jv.Volume(random.uniform(0.2, 1, shape).astype(np.float32), labels=labels)
+    functions = [uniform_transfer(extinction, random.random(3)) for extinction in (0.02, 0, 0.3, 1.5)]
+    transfer, camera = jv.LabelTransferFunction(functions), around(volume, (24, 24))
+    gap = jv.Clip((3.3, 7.6, 2.9, 7.1, 4.2, 8.8), inside_out=True)
+    march = jv.March(1.3, (jv.Jitter(3), gap, jv.AlphaCorrection(labels=True)), quadrature)
+    assert changes_of(volume) is not None
+
+    @jax.jit
+    def image_and_slope(labels):
+        traced = volume if labels is None else eqx.tree_at(lambda v: v.labels, volume, labels)
+
+        def image(factor):
+            return jv.render(traced, transfer.with_opacity({1: factor - 1, 2: factor}), camera, march)
+
+        return jax.jvp(image, (jnp.float32(1),), (jnp.float32(1),))
+
+    (merged, slope), (single, other) = image_and_slope(None), image_and_slope(volume.labels)
+    np.testing.assert_allclose(merged.rgba, single.rgba, atol=3e-6)
+    np.testing.assert_allclose(slope.rgba, other.rgba, atol=2e-5)
+    np.testing.assert_allclose(merged.depth, single.depth, rtol=1e-5)
+    np.testing.assert_array_equal(merged.samples, single.samples)
+    np.testing.assert_array_equal(merged.aligned, single.aligned)
+    assert np.asarray(single.aligned).any()
 
 
 @pytest.mark.parametrize("fast", [True, False])
