@@ -285,8 +285,8 @@ def with_words(
 
 
 def changes_of(volume: Volume) -> UInt32[Array, " nodes"] | None:
-    """Words of `_label_changes`, on a CPU. None for labels that are traced, if there are none, or if the words
-    would take too much memory."""
+    """Words of `_label_changes`, on a CPU. None for labels that are traced, if there are none, or if the
+    words would take too much memory."""
     labels = volume.labels
     if not isinstance(labels, jax.Array) or is_traced(labels) or platform() != "cpu":
         return None
