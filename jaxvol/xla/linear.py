@@ -4,21 +4,24 @@ has no forward mode. Here, it transposes one primitive, also under forward mode.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .compiling import compiled
 from .differentiation import forward_only, not_transposed
 from .platform import is_traced
 from .trees import PyTree, floats, is_none
+
+
+AnyArray: TypeAlias = Array | np.ndarray  # JAX keeps some constants in NumPy
 
 
 def differentiable(
@@ -69,12 +72,12 @@ def differentiable(
             moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents[:tree_size]]
             known = len(primals)
 
-            def pushed(constants: Sequence[ArrayLike], moving: Sequence[Array]) -> list[Array]:
+            def pushed(constants: Sequence[AnyArray], moving: Sequence[Array]) -> list[Array]:
                 tangent = iter(moving)
                 tree_dot = like_tree([next(tangent) if moves_ else None for moves_ in moves], None)
                 return jax.tree.leaves(push(tree_dot, *arguments(constants[:known])))
 
-            def pulled(constants: Sequence[ArrayLike], cotangents: Sequence[Array]) -> list[Array]:
+            def pulled(constants: Sequence[AnyArray], cotangents: Sequence[Array]) -> list[Array]:
                 cotangent = iter(cotangents)
                 results_bar = [next(cotangent) if float_ else None for float_ in is_float]
                 residuals = jax.tree.unflatten(kept_structure, constants[known:])
@@ -139,7 +142,7 @@ def _pushed(*operands: Array, count: int, push: Any, **_: Any) -> list[Array]:
 
 
 def _jvp(
-    primals: Sequence[ArrayLike], tangents: Sequence[Any], *, count: int, **params: Any
+    primals: Sequence[AnyArray], tangents: Sequence[Any], *, count: int, **params: Any
 ) -> tuple[Any, Any]:
     constants, moving = primals[:count], primals[count:]
     results = _PUSH.bind(*primals, count=count, **params)
@@ -167,7 +170,7 @@ def _transpose(cotangents: Sequence[Any], *operands: Any, count: int, pull: Any,
 
 
 def _batched(
-    operands: Sequence[ArrayLike],
+    operands: Sequence[AnyArray],
     axes: Sequence[Any],
     *,
     count: int,
@@ -179,10 +182,10 @@ def _batched(
     size = next(leaf.shape[axis] for leaf, axis in zip(operands, axes, strict=True) if axis is not None)
     constant_axes, moving_axes = list(axes[:count]), list(axes[count:])
 
-    def pushes(constants: Sequence[ArrayLike], moving: Sequence[Array]) -> list[Array]:
+    def pushes(constants: Sequence[AnyArray], moving: Sequence[Array]) -> list[Array]:
         return jax.vmap(push, in_axes=(constant_axes, moving_axes))(list(constants), list(moving))
 
-    def pulls(constants: Sequence[ArrayLike], cotangents: Sequence[Array]) -> list[Array]:
+    def pulls(constants: Sequence[AnyArray], cotangents: Sequence[Array]) -> list[Array]:
         parts = jax.vmap(pull, in_axes=(constant_axes, 0))(list(constants), list(cotangents))
         pairs = zip(parts, moving_axes, strict=True)
         return [jnp.sum(part, 0) if axis is None else jnp.moveaxis(part, 0, axis) for part, axis in pairs]
