@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -42,7 +42,7 @@ class Noise(eqx.Module):
         if total == 0:
             return None
         noisy = sum(np.count_nonzero(image) for image in variances)
-        return cls(*(jnp.asarray(number, jnp.float32) for number in (total, noisy, total**2 / squares)))
+        return cls(*(jax.device_put(np.float32(number)) for number in (total, noisy, total**2 / squares)))
 
     def reduced_chi_squared(self, squares: float, numbers: int) -> float | None:
         """Reduced χ² of a residual's sum of `squares` after a fit of `numbers`; None without freedom."""

@@ -23,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import Arrayable, described, integer
+from .._util.checks import Arrayable, all_finite, described, integer
 from ..path_tracing import path_trace
 from ..ray import check_arguments
 from ..scene.camera import Camera
@@ -266,6 +266,7 @@ class SampledRun(eqx.Module):
     path_covariance: Float[Array, "free free"]
 
     @classmethod
+    @eqx.filter_jit
     def of(cls, problem: SampledProblem | Any, y: FreeVariables) -> "SampledRun":
         """The state before any step. `problem`: an object with the method `sample` of `SampledProblem`."""
         (flat, _), no = ravel_pytree(y), jnp.zeros((), bool)
@@ -296,7 +297,7 @@ class SampledRun(eqx.Module):
         """The state after another sample, or this one if that is not finite, and the sample's loss."""
         run = self.advanced(problem)
         # a loss may be finite where its derivative isn't
-        finite = np.all(np.isfinite(ravel_pytree(run.best)[0])) and np.isfinite(run.sampled)
+        finite = all_finite(jax.device_get((run.best, run.sampled)))
         return (run, float(run.sampled)) if finite else (self, math.nan)
 
     @property
