@@ -223,7 +223,8 @@ class ProbeGeometry(Bijection):
         if not isinstance(start, ToroidalMap):
             raise ValueError(f"start must be a ToroidalMap; got {described(start)}.")
         self.start = start
-        self.length = Positive(start.b + start.gamma_range[1])
+        _, (b, depths) = in_numpy(start.b, start.gamma_range)
+        self.length = Positive(b + depths[1])
 
     def forward(self, free: dict[str, Any]) -> ToroidalMap:
         start = jax.lax.stop_gradient(self.start)

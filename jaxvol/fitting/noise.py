@@ -72,8 +72,9 @@ def path_traced_view(
     mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1), where var L is that of
     the mean radiance, the square of `PathTraced.standard_error`.
     """
-    arrays = traced.radiance, traced.deviations, traced.opacity[..., None], background
+    arrays = traced.radiance, traced.deviations, traced.opacity, background
     radiance, deviations, opacity, color = (np.asarray(array, np.float64) for array in arrays)
+    opacity = opacity[..., None]
     image = radiance + (1 - opacity) * color
     if traced.paths < 2:
         return image, None

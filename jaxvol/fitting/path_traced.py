@@ -238,6 +238,9 @@ class Averages(eqx.Module):
         return self.point - inverse @ gradient, covariance, loss
 
 
+_triangles = jax.jit(Triangles.of)
+
+
 class SampledRun(eqx.Module):
     """State of a fit by samples.
 
@@ -303,9 +306,8 @@ class SampledRun(eqx.Module):
     @property
     def triangles(self) -> Triangles:
         """Triangles of the mean residual and Jacobian of the averaged samples."""
-        rows, scores, informed = Triangles.of(self.window.rows)
-        rows, scores = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in (rows, scores))
-        return Triangles(rows, scores, informed)
+        rows, scores, informed = jax.device_get(_triangles(self.window.rows))
+        return Triangles(*jax.device_put((np.linalg.qr(rows, "r"), np.linalg.qr(scores, "r"), informed)))
 
     @property
     def settled(self) -> bool:
@@ -314,7 +316,7 @@ class SampledRun(eqx.Module):
 
     def ratio(self, problem: SampledProblem, limits: Limits) -> float:
         """Largest ratio of standard errors, by paths over by references, beyond the tolerances."""
-        flat = np.asarray(ravel_pytree(self.best)[0], np.float64)
+        flat = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(jax.device_get(self.best))])
         by_paths = np.sqrt(np.maximum(np.diag(np.asarray(self.path_covariance, np.float64)), 0))
         spread = spreads(self.triangles, problem.count, problem.scale).unequal
         by_references = np.maximum(np.sqrt(np.sum(spread**2, axis=1)), np.finfo(float).tiny)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array
 from ..path_tracing import PathTraced
 from ..scene.camera import Camera
-from ..xla.platform import in_numpy
+from ..xla.platform import stack
 from ..xla.trees import PyTree
 from .noise import Noise, path_traced_view, pixel_values
 
@@ -47,7 +47,7 @@ class References(eqx.Module):
         for number, (camera, image, _) in enumerate(read):
             kinds.setdefault((jax.tree.structure(camera), image.shape), []).append(number)
         pairs = [[read[number][:2] for number in kind] for kind in kinds.values()]
-        groups = [jax.tree.map(_stack, *kind) for kind in pairs]
+        groups = [jax.tree.map(lambda *leaves: stack(leaves), *kind) for kind in pairs]
         stacked = [
             None if counted is None else jax.device_put(np.stack([counted[number] for number in kind]))
             for kind in kinds.values()
@@ -83,11 +83,6 @@ def _weights(value: PyTree, shapes: list[tuple[int, ...]]) -> list[np.ndarray] |
         raise ValueError("weights must be positive for one pixel at least; got 0 for all.")
     scale = count / sum(weight.sum() for weight in full)
     return [(scale * weight).astype(np.float32) for weight in full]
-
-
-def _stack(*leaves: Array) -> Array:
-    xp, leaves = in_numpy(*leaves)
-    return jnp.asarray(xp.stack(leaves), leaves[0].dtype)
 
 
 def camera_and_image(number: int, view: object) -> tuple[Camera, Any]:

@@ -14,6 +14,7 @@ from .._util.checks import Arrayable, described, flag, integer, not_negative
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
+from ..xla.platform import in_numpy, stack
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
@@ -57,11 +58,12 @@ class LabelTransferFunction(Transfer):
                 "functions must count lengths in world length; got one with per_voxel=True. Pass a "
                 "unit_distance, such as the volume: jv.colormap(..., unit_distance=volume)."
             )
-        hidden = TransferFunction(visible[0].values, 0 * visible[0].colors, 0 * visible[0].extinction)
+        n = visible[0].values.shape[0]
+        hidden = TransferFunction(visible[0].values, np.zeros((n, 3)), np.zeros(n))
         complete = [hidden if function is None else function for function in [*by_label, None]]
         self.stacked = _stacked(complete)
-        self.opacity = jnp.asarray(np.ones(len(complete)), self.stacked.extinction.dtype)
-        self.shown = jnp.asarray(np.ones(len(complete)), bool)
+        self.opacity = jnp.array(np.ones(len(complete), self.stacked.extinction.dtype))
+        self.shown = jnp.array(np.ones(len(complete), bool))
 
     def with_visibility(self, visible: Mapping[Any, bool | np.bool_ | Array]) -> "LabelTransferFunction":
         """A copy with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
@@ -185,17 +187,17 @@ def _by_label(functions: Any) -> list[TransferFunction | None]:
     return list(functions)
 
 
-@jax.jit
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:
     """The functions along a leading axis, padded to the same number of points with copies of the last one."""
     points = max(function.values.shape[0] for function in functions)
+    xp, functions = in_numpy(*functions)
 
     def continued(function: TransferFunction) -> TransferFunction:
         values, missing = function.values, points - function.values.shape[0]
         # far enough apart to differ in the float type
-        gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
-        beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
-        padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, *[leaf[-1:]] * missing]), function)
-        return eqx.tree_at(lambda f: f.values, padded, jnp.concatenate([values, beyond]))
+        gap = xp.maximum(values[-1] - values[0], xp.maximum(abs(values[-1]), 1))
+        beyond = values[-1] + gap * xp.arange(1, missing + 1, dtype=values.dtype)
+        padded = jax.tree.map(lambda leaf: xp.concatenate([leaf, *[leaf[-1:]] * missing]), function)
+        return eqx.tree_at(lambda f: f.values, padded, xp.concatenate([values, beyond]))
 
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(continued, functions))
+    return jax.tree.map(lambda *leaves: stack(leaves), *map(continued, functions))

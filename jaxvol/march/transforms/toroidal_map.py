@@ -24,6 +24,7 @@ from ..._util.vec3 import Scalar, Vec3, apart
 from ...scene.occupancy import BLOCK, Occupancy
 from ...scene.space import Gap, Space, blocks_in_reach
 from ...scene.volume import Volume
+from ...xla.platform import in_numpy
 from ..march import Transform
 from .sector_faces import SectorFaces, hypot
 
@@ -121,8 +122,9 @@ class ToroidalMap(Transform):
     @property
     def nearest_to_axis(self) -> Float[Array, ""]:
         """ρ of the sample nearest to the motor axis, world length; negative if it lies behind the axis."""
-        depth = self.b + self.gamma_range[0]
-        return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
+        xp, (probe,) = in_numpy(self)
+        depth = probe.b + probe.gamma_range[0]
+        return jnp.asarray(xp.asarray(probe.a + depth * xp.min(xp.sin(probe.sigma_range))), self.a.dtype)
 
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:
