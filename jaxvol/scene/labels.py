@@ -62,8 +62,8 @@ class LabelTransferFunction(Transfer):
         hidden = TransferFunction(visible[0].values, np.zeros((n, 3)), np.zeros(n))
         complete = [hidden if function is None else function for function in [*by_label, None]]
         self.stacked = _stacked(complete)
-        self.opacity = jnp.array(np.ones(len(complete), self.stacked.extinction.dtype))
-        self.shown = jnp.array(np.ones(len(complete), bool))
+        self.opacity = jnp.asarray(np.ones(len(complete), dtype := self.stacked.extinction.dtype), dtype)
+        self.shown = jnp.asarray(np.ones(len(complete), bool), bool)
 
     def with_visibility(self, visible: Mapping[Any, bool | np.bool_ | Array]) -> "LabelTransferFunction":
         """A copy with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.

@@ -34,7 +34,7 @@ VOLUME, TRANSFER = (
     jv.Volume(np.zeros((9, 9, 9), np.float32)),
     jv.colormap("gray", (0.0, 1.0), unit_distance=1.0),
 )
-PAIR = ScattererTemplate(jnp.zeros((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
+PAIR = ScattererTemplate(*jax.device_put((np.zeros((1, 1, 2, 3), "f4"), np.ones((1, 1, 2), "f4"))))
 
 
 def grown(material=HALF, **how):

@@ -61,7 +61,7 @@ def test_the_gradient_is_interpolated_between_central_differences(kind, shape):
     stored = slopes_of(volume) is not None
     assert stored == (kind in ("uint8", "int8"))
     for each in (volume, accelerated(volume)) if stored else (volume,):
-        np.testing.assert_allclose(gradients(each, jnp.asarray(at)), expected, atol=2e-3)
+        np.testing.assert_allclose(gradients(each, at), expected, atol=2e-3)
 
 
 def test_slopes_are_stored_for_those_who_read_them():
@@ -73,7 +73,7 @@ def test_slopes_are_stored_for_those_who_read_them():
 def normals(volume, space, points):
     """Unit gradients at world points."""
     gradient = jax.jit(jax.vmap(lambda point: jnp.stack(world_gradient(volume, space, apart(point)))))
-    found = np.asarray(gradient(jnp.asarray(points, jnp.float32)))
+    found = np.asarray(gradient(np.float32(points)))
     return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
@@ -88,7 +88,7 @@ def test_normals_are_those_of_the_world_under_a_toroidal_map():
     to_world = jax.jit(jax.vmap(lambda c: jnp.stack(space.point(apart(c)))))
     ramp = np.array([0.5, -0.7, 0.4]) / np.linalg.norm([0.5, -0.7, 0.4])
     nodes = np.indices(shape).reshape(3, -1).T.astype(np.float32)
-    points = np.asarray(to_world(jnp.asarray(nodes)))
+    points = np.asarray(to_world(nodes))
     volume = jv.Volume((points @ ramp).astype(np.float32).reshape(shape))
     inner = points.reshape(*shape, 3)[3:-3:7, 3:-3:7, 3:-3:7].reshape(-1, 3) + 0.1
     assert np.max(angles(normals(volume, space, inner), ramp[None])) < 0.5
@@ -239,7 +239,7 @@ LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ea
 def test_images_are_those_of_the_reference(transforms, kind, light, quadrature):
     scene, lighting = scene_of(transforms, kind, quadrature), Phong(LIGHTS[light])
     found = jv.render(*scene, lighting=lighting)
-    assert found.rgba[..., :3].max() > 0.1
+    assert np.asarray(found.rgba)[..., :3].max() > 0.1
     np.testing.assert_allclose(found.rgba, image_of_reference(*scene, lighting), atol=2e-5)
 
 

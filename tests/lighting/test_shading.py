@@ -63,7 +63,7 @@ class Fog(Shading):
 # ---------------------------------------------------------------- images
 
 LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)
-FOG = Fog(jnp.asarray([0.03, 0.06, 0.05]), jnp.asarray(0.7))
+FOG = Fog(*jax.device_put((np.float32([0.03, 0.06, 0.05]), np.float32(0.7))))
 
 
 def scene_of():
@@ -108,10 +108,9 @@ LEAVES = {
 # ---------------------------------------------------------------- many samples together
 
 RANDOM = np.random.default_rng(0)
-PHOTONS = ScattererTemplate(
-    jnp.asarray(RANDOM.normal(0, 0.15, (1, 2, 11, 3)), jnp.float32),
-    jnp.asarray(np.append(RANDOM.uniform(0.02, 0.5, (1, 2, 10)), np.zeros((1, 2, 1)), axis=-1), jnp.float32),
-)
+OFFSETS = RANDOM.normal(0, 0.15, (1, 2, 11, 3))
+INTENSITIES = np.append(RANDOM.uniform(0.02, 0.5, (1, 2, 10)), np.zeros((1, 2, 1)), axis=-1)
+PHOTONS = ScattererTemplate(*jax.device_put((np.float32(OFFSETS), np.float32(INTENSITIES))))
 """Two templates, which are not sorted, with room for a photon that neither holds."""
 
 

@@ -246,5 +246,6 @@ def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes
         origins.append(finite_array(f"the origin of planes[{i}]", origin, (3,)))
         normals.append(require(normal, lambda normal: abs(normal).max() > 0, message))
     if not pairs:
-        return jnp.array(np.zeros((0, 3))), jnp.array(np.zeros((0, 3)))
+        none = finite_array("planes", np.zeros((0, 3)), (0, 3))
+        return none, none
     return stack(origins), stack(normals)
