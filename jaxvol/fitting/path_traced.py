@@ -312,7 +312,7 @@ class SampledRun(eqx.Module):
     @property
     def settled(self) -> bool:
         """True if neither the last step nor any step to an averaged sample was shortened."""
-        return not (bool(self.cut) or self.window.cut > 0)
+        return not (bool(self.cut) or float(self.window.cut) > 0)
 
     def ratio(self, problem: SampledProblem, limits: Limits) -> float:
         """Largest ratio of standard errors, by paths over by references, beyond the tolerances."""

@@ -14,7 +14,7 @@ from .._util.checks import Arrayable, described, flag, integer, not_negative
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
-from ..xla.platform import in_numpy, stack
+from ..xla.platform import in_numpy, is_traced, stack
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
@@ -74,7 +74,7 @@ class LabelTransferFunction(Transfer):
         result = self.shown
         for label, shown in self._changes("visible", visible):
             is_array = isinstance(shown, jax.Array) and shown.shape == () and shown.dtype == bool
-            result = result.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
+            result = _with_entry(result, label, shown if is_array else flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, result)
 
     def with_opacity(self, opacity: Mapping[Any, Arrayable]) -> "LabelTransferFunction":
@@ -89,8 +89,7 @@ class LabelTransferFunction(Transfer):
         """
         result = self.opacity
         for label, factor in self._changes("opacity", opacity):
-            factor = not_negative(f"opacity[{label}]", factor)
-            result = result.at[label].set(factor.astype(result.dtype))
+            result = _with_entry(result, label, not_negative(f"opacity[{label}]", factor))
         return eqx.tree_at(lambda transfer: transfer.opacity, self, result)
 
     def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
@@ -185,6 +184,15 @@ def _by_label(functions: Any) -> list[TransferFunction | None]:
                 f"functions[{label}] must be a TransferFunction, or None; got {described(entry)}."
             )
     return list(functions)
+
+
+def _with_entry(array: Array, label: int, entry: Array | bool) -> Array:
+    """The array with another entry; by NumPy, which compiles nothing, if both are concrete."""
+    if is_traced(array, entry):
+        return array.at[label].set(jnp.asarray(entry, array.dtype))
+    changed = np.array(array)
+    changed[label] = entry
+    return jnp.asarray(changed, array.dtype)
 
 
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:

@@ -120,7 +120,7 @@ class Volume(eqx.Module):
             return eqx.tree_pformat(self)
         data, place = np.asarray(self.data), ("spacing", "origin", "direction")
         parts = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
-        parts += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        parts += [] if self.labels is None else [f"labels to {np.asarray(self.labels).max()}"]
         parts += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
         return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(parts)}>"
 

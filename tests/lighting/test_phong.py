@@ -17,7 +17,7 @@ from jaxvol.lighting import DirectionalLight, HeadLight, Phong, PointLight
 from jaxvol.lighting.shading import Shader
 from jaxvol.scene.space import Affine, world_gradient
 
-from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, slow
+from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, rendered, slow
 from .samples import check_gradient, image_of_reference, in_double, sample_at, surroundings
 
 
@@ -128,7 +128,7 @@ def all_slopes(scene, viewer):
 
 def color_of(lighting, gradient, viewer):
     scene = of_gradient(gradient), lighting
-    return np.asarray(all_slopes(scene, jnp.asarray(viewer, jnp.float32))[0][1])
+    return np.asarray(all_slopes(scene, np.float32(viewer))[0][1])
 
 
 def by_formula(normal, viewer, lights, power=10.0):
@@ -187,7 +187,7 @@ OF_SAMPLES = {
 def test_gradients_of_a_sample_match_central_differences():
     """Slow tests below are of images."""
     with in_float64():
-        viewer = jnp.asarray(VIEWS[1])
+        viewer = jax.device_put(np.asarray(VIEWS[1], float))
         lights = HeadLight(), DirectionalLight(-VIEWS[0]), PointLight(POINT + 2 * VIEWS[1], (3.0, 4.0, 5.0))
         scene = in_double((of_gradient(0.7 * unit(0.2, -0.1, 1)), Phong(lights)))
 
@@ -238,7 +238,7 @@ LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ea
 )
 def test_images_are_those_of_the_reference(transforms, kind, light, quadrature):
     scene, lighting = scene_of(transforms, kind, quadrature), Phong(LIGHTS[light])
-    found = jv.render(*scene, lighting=lighting)
+    found = rendered(*scene, lighting=lighting)
     assert np.asarray(found.rgba)[..., :3].max() > 0.1
     np.testing.assert_allclose(found.rgba, image_of_reference(*scene, lighting), atol=2e-5)
 

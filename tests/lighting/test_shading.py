@@ -124,7 +124,7 @@ def inside(volume, count=32):
     """Points inside the sphere, and a pixel for each."""
     low, high = (np.asarray(end) for end in volume.corners)
     points = np.random.default_rng(1).uniform(0.3, 0.7, (count, 3)) * (high - low) + low
-    return jnp.asarray(points, jnp.float32), jnp.asarray(np.arange(2 * count, dtype=np.int32).reshape(-1, 2))
+    return points.astype(np.float32), np.arange(2 * count, dtype=np.int32).reshape(-1, 2)
 
 
 @pytest.mark.parametrize("occlusion", ["hard", *slow("soft")])
@@ -139,7 +139,7 @@ def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
         return [shaded(lighting, *rest, together=together) for together in (True, False)]
 
     for bright in (1.0, 0.3, 0.1, 0.05):
-        found, expected = both(jnp.asarray(bright * np.linspace(0.2, 1, 32), jnp.float32))
+        found, expected = both(np.float32(bright * np.linspace(0.2, 1, 32)))
         np.testing.assert_allclose(found, expected, atol=1e-6)
         assert (np.max(found) > 0.01) == (bright > 0.05)
 
@@ -210,7 +210,7 @@ def test_the_loop_ends_where_none_of_the_samples_needs_more():
     volume, transfer = scaled_phantom("sphere"), soft_transfer(0.1)
     points, pixels = inside(volume)
     for most, expected in ((0.04, 0), (0.06, 5), (0.24, 5), (0.33, 9), (np.nan, 9)):
-        transmittance = jnp.asarray(np.linspace(0, most, 32), jnp.float32)
+        transmittance = np.linspace(0, most, 32, dtype=np.float32)
         found = program(CountedTerms(), volume, transfer, points, transmittance, pixels, together=True)
         np.testing.assert_array_equal(found, expected)
 
