@@ -65,7 +65,7 @@ def in_numpy(*values: Any) -> tuple[Any, Any]:
     return (jnp, values) if is_traced(*values) else (np, jax.tree.map(np.asarray, values))
 
 
-def stack(leaves: Sequence[Array | np.ndarray]) -> Array:
+def stack(leaves: Sequence[Array | np.ndarray | np.generic]) -> Array:
     """`jnp.stack`, which compiles no program if the arrays are concrete."""
     xp, leaves = in_numpy(*leaves)
     return jnp.asarray(xp.stack(leaves), leaves[0].dtype)

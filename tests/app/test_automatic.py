@@ -220,7 +220,8 @@ def test_labels_are_shown_in_colours_of_their_own():
     assert apart[[0, 1, 116]].min() > 0.3  # of the first three labels
     assert apart.min() > 0.004
     across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
-    assert opacity_at(jax.tree.map(lambda leaf: leaf[1], transfer.stacked), INSIDE, 0.02 * across) > 0.9
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[1], transfer.stacked)
+    assert opacity_at(first, INSIDE, 0.02 * across) > 0.9
 
 
 def test_other_volumes_are_not_taken_for_labels():

@@ -113,7 +113,7 @@ def test_in_a_shell_rays_leap_and_show_what_the_reference_shows(opacities):
         np.testing.assert_allclose(leapt.rgba, whole.rgba, atol=1e-12)
         fewer = np.asarray(leapt.samples) < np.asarray(whole.samples) / 2
         assert fewer.sum() > RAYS / 4, (leapt.samples, whole.samples)
-        assert (np.asarray(whole.opacity) > 0.1).sum() > RAYS / 4
+        assert (np.asarray(whole.rgba)[..., 3] > 0.1).sum() > RAYS / 4
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, expected)
 
 

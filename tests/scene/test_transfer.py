@@ -147,7 +147,7 @@ def test_opacity_of_a_unit_distance_converts_exactly():
     opacities = [0.0, 0.1, 0.5, 0.9]
     points = [(float(i), (1, 1, 1), a) for i, a in enumerate(opacities)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=2.5)
-    opacity = jax.jit(jv.TransferFunction.opacity)
+    opacity = jax.jit(jv.TransferFunction.opacity, static_argnums=1)
     np.testing.assert_allclose(opacity(transfer, 2.5), opacities, atol=1e-7)
     # half the distance: 1 - sqrt(1 - a)
     np.testing.assert_allclose(opacity(transfer, 1.25), 1 - np.sqrt(1 - np.array(opacities)), atol=1e-7)
