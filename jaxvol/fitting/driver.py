@@ -261,7 +261,7 @@ class _Run(eqx.Module):
 
     def ended(self, problem: Problem, losses: list[float], limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
-        if not all_finite(jax.device_get(self.y)) or not math.isfinite(losses[-1]):
+        if not math.isfinite(losses[-1]):
             return Outcome.nonfinite
         if self.done or self.result != Outcome.successful:
             return self.result
@@ -296,8 +296,9 @@ def _advance(solver: Solver, problem: Problem, y: FreeVariables, state: Any) -> 
     with allow_promotion():
         y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
         done, result = solver.terminate(problem, y, None, {}, state, frozenset())
+    result = Outcome.where(all_finite(y), Outcome.promote(result), Outcome.nonfinite)
     # solvers with trial points return `aux` of the previous point; their state has that of the new one
-    return strong((y, state, getattr(state, "aux", previous_aux), done, Outcome.promote(result)))
+    return strong((y, state, getattr(state, "aux", previous_aux), done, result))
 
 
 @contextmanager

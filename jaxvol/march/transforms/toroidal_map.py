@@ -102,7 +102,7 @@ class ToroidalMap(Transform):
         # depth and angles are separable: extremes lie at the ends of the ranges, or in the middle of angles
         xp, (probe,) = in_numpy(self)
         angles = (ends - math.pi / 2 for ends in (probe.sigma_range, probe.beta_range))
-        fan, turn = (xp.append(ends, xp.clip(0.0, *ends)) for ends in angles)
+        fan, turn = (xp.append(ends, xp.clip(xp.zeros((), ends.dtype), *ends)) for ends in angles)
         depth = probe.b + probe.gamma_range
         x = xp.outer(depth, xp.sin(fan))
         rho = probe.a + xp.outer(depth, xp.cos(fan))

@@ -437,9 +437,8 @@ def test_a_box_and_a_plane_clip_what_is_shown(controlled):
     assert isinstance(clip, jv.Clip)
     assert clip.box is not None
     np.testing.assert_allclose(clip.box, (3, 9, *np.asarray(BALL.bounds)[2:]))
-    np.testing.assert_allclose(
-        np.concatenate([clip.origins, clip.normals]), (BALL.center, -orbit.toward), rtol=1e-5
-    )
+    plane = np.concatenate([clip.origins, clip.normals])
+    np.testing.assert_allclose(plane, (BALL.center, -orbit.toward), rtol=1e-5)
     for depth in (-1.0, 1.0):  # from nothing to all
         controls["depth"].set(depth)
         origin, normal = model.scene.plane(model.state)
