@@ -79,7 +79,7 @@ def templates(materials: Any) -> ScattererTemplates:
 
 def marching(volume: jv.Volume, steps: int = 1) -> jv.March:
     """So many steps a voxel."""
-    return jv.March(float(volume.spacing.min()) / steps, (jv.AlphaCorrection(),), "midpoint")
+    return jv.March(float(np.asarray(volume.spacing).min()) / steps, (jv.AlphaCorrection(),), "midpoint")
 
 
 def three_materials(size: int, resolution: int) -> dict[str, Any]:

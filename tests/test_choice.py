@@ -29,15 +29,17 @@ class Polynomial(eqx.Module):
 
 
 def polynomial(views):
-    return Polynomial(*(jnp.asarray(np.concatenate(each), jnp.float32) for each in zip(*views, strict=True)))
+    return Polynomial(
+        *(jax.device_put(np.float32(np.concatenate(each))) for each in zip(*views, strict=True))
+    )
 
 
 def one_more(coefficients):
-    return jnp.asarray(np.append(coefficients, np.float32(0)))
+    return jax.device_put(np.append(coefficients, np.float32(0)))
 
 
 def zeros(n):
-    return jnp.asarray(np.zeros(n, np.float32))
+    return jax.device_put(np.zeros(n, np.float32))
 
 
 POLYNOMIALS = [

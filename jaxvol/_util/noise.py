@@ -85,4 +85,4 @@ def blue_tile() -> Float[Array, "side side"]:
     """Tile of blue noise in (0, 1), periodic; its ranks are by void and cluster (Ulichney 1993)."""
     ranks = np.load(Path(__file__).with_name("blue_noise.npy"))
     with jax.ensure_compile_time_eval():
-        return jnp.asarray((ranks + 0.5) / ranks.size, jnp.float32)
+        return jnp.asarray(((ranks + 0.5) / ranks.size).astype(np.float32), jnp.float32)

@@ -80,10 +80,11 @@ def _narrow(data: Array | np.ndarray) -> np.ndarray:
             f"data must be of type {', '.join(DTYPES)} if traced; got {data.dtype}, whose range is not known "
             "before the program runs. Convert them: data.astype(jnp.float32)."
         )
+    data = np.asarray(data)
     low, high = int(data.min()), int(data.max())
     for dtype, (minimum, maximum) in WHOLE.items():
         if minimum <= low and high <= maximum:
-            return np.asarray(data).astype(dtype)
+            return data.astype(dtype)
     raise ValueError(
         "data must be whole numbers from -2**24 to 2**24, which float32 holds exactly; got "
         f"{data.dtype} from {low} to {high}. Subtract an offset, or rescale them to data.astype(np.float32)."

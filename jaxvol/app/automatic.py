@@ -265,7 +265,7 @@ def range_of_object(volume: Volume) -> tuple[float, float]:
 def xray_transfer(volume: Volume, cmap: Arrayable, clim: tuple[float, float]) -> TransferFunction:
     """Extinction that grows over a range, scaled so that the brightest pixel along an axis is 1."""
     colors = colormap(cmap, clim)
-    slope, brightest = np.linspace(0, 1, len(colors.values)), np.max(colors.colors, axis=1)
+    slope, brightest = np.linspace(0, 1, len(colors.values)), np.max(np.asarray(colors.colors), axis=1)
     emitted = np.interp(sampled(volume), colors.values, slope * brightest)
     steps = np.asarray(volume.spacing) * stride_of(volume.shape)
     peak = max(np.percentile(step * emitted.sum(axis), 99.9) for axis, step in enumerate(steps))

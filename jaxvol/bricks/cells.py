@@ -40,6 +40,7 @@ class BrickCells(NamedTuple):
     any: Bool[Array, ""]
 
 
+@jax.jit
 def padded(cells: CellRange) -> CellRange:
     """The cells, and their neighbours whose samples may be shifted into them."""
     nonempty = cells.until > cells.first

@@ -148,7 +148,7 @@ class Traversal:
         self, brick: int, passable: np.ndarray, empty: np.ndarray, reached: Array, beyond: int = 0
     ) -> BrickCells | None:
         """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
-        visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
+        visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable, bool), jnp.asarray(empty, bool)
         march = self.scene.march
         # from the start, before any shift, else a shift would move a waiting cell out of its brick
         at = with_fields(self.start, finished=self.at.finished)

@@ -2,18 +2,19 @@
 The scene is rendered at `forward(free)`, so no step can leave the allowed range."""
 
 from abc import abstractmethod
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, described, finite_array, number, require
 from ..march.transforms.toroidal_map import ToroidalMap
 from ..scene.camera import Camera, axes_of
+from ..xla.platform import in_numpy
 from ..xla.trees import PyTree
 
 
@@ -119,8 +120,10 @@ class Positive(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must not be negative to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
-        ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
-        return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
+        xp, (value, scale) = in_numpy(value, self.scale)
+        ratio = xp.maximum(value / scale.astype(value.dtype), MARGIN)
+        # inverse of softplus, which JAX lacks
+        return jnp.asarray(xp.asarray(ratio + xp.log(-xp.expm1(-ratio))), value.dtype)
 
     def reach(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         return jnp.maximum(1, REACH * free)  # below 0, free is a logarithm
@@ -139,7 +142,9 @@ class UnitInterval(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must be in [0, 1] to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: (v >= 0) & (v <= 1), message)
-        return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
+        xp, (inner,) = in_numpy(value)
+        inner = xp.clip(inner, MARGIN, 1 - MARGIN)
+        return jnp.asarray(xp.asarray(xp.log(inner / (1 - inner))), value.dtype)
 
 
 class Pose(Bijection):
@@ -168,8 +173,8 @@ class Pose(Bijection):
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
         from scipy.spatial.transform import Rotation  # here, so that a first image does not wait for it
 
-        start = self.start
-        invariants = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
+        start, value = jax.device_get((self.start, value))
+        invariants = [(c.view_angle, c.parallel_scale, c.window, _distance(c, np)) for c in (start, value)]
         if jax.tree.structure(value) != jax.tree.structure(start) or not all(
             np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, invariants), strict=True)
         ):
@@ -179,15 +184,15 @@ class Pose(Bijection):
             )
         before, after = (np.stack(axes_of(c, np), axis=1).astype(float) for c in (start, value))
         rotation = Rotation.from_matrix(after @ before.T).as_rotvec()
-        shift = (value.focal_point - start.focal_point) / _distance(start)
-        return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}
+        shift = (value.focal_point - start.focal_point) / _distance(start, np)
+        return jax.device_put({"rotation": rotation.astype(shift.dtype), "translation": shift})
 
     def moved(self, value: Camera) -> dict[str, Float[Array, "3"]]:
         return {name: getattr(value, name) for name in ("position", "focal_point", "view_up")}
 
 
-def _distance(camera: Camera) -> Float[Array, ""]:
-    return jnp.linalg.norm(camera.position - camera.focal_point)
+def _distance(camera: Camera, xp: ModuleType = jnp) -> Any:
+    return xp.linalg.norm(camera.position - camera.focal_point)
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -231,7 +236,8 @@ class ProbeGeometry(Bijection):
         if not isinstance(start, ToroidalMap):
             raise ValueError(f"start must be a ToroidalMap; got {described(start)}.")
         self.start = start
-        self.length = Positive(start.b + start.gamma_range[1])
+        _, (b, depths) = in_numpy(start.b, start.gamma_range)
+        self.length = Positive(b + depths[1])
 
     def forward(self, free: dict[str, Any]) -> ToroidalMap:
         start = jax.lax.stop_gradient(self.start)
@@ -261,7 +267,8 @@ class ProbeGeometry(Bijection):
             "{got} from it. Raise a, or narrow sigma_range.",
             self.length.scale,
         )
-        near, axis = value.b + value.gamma_range[0], jnp.maximum(nearest, 0)
+        value = jax.device_get(value)
+        near, axis = value.b + value.gamma_range[0], np.maximum(nearest, 0)
         lengths = {"near": near, "axis": axis, "span": value.gamma_range[1] - value.gamma_range[0]}
         free = {key: self.length.inverse(length, f"{name}, {key}") for key, length in lengths.items()}
         return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
@@ -271,11 +278,11 @@ class ProbeGeometry(Bijection):
         return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
 
 
-def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
+def _ratios(angles: Float[np.ndarray, "2"]) -> Float[Array, "2"]:
     """Logarithms of the angles below and above a range of angles, relative to its width."""
-    gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
-    gaps = jnp.maximum(gaps, MARGIN * jnp.pi)
-    return jnp.log(gaps[::2] / gaps[1])
+    gaps = np.stack([angles[0], angles[1] - angles[0], np.pi - angles[1]])
+    gaps = np.maximum(gaps, MARGIN * np.pi)
+    return jnp.asarray(np.log(gaps[::2] / gaps[1]), angles.dtype)
 
 
 def _range_of(ratios: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -55,12 +55,17 @@ class Free(eqx.Module):
 
     def forward(self, free: FreeVariables) -> PyTree:
         """Parameters at the free variables."""
-        nodes = [b.forward(variables) for b, variables in zip(self.bijections, free, strict=True)]
-        return jax.tree.unflatten(self.structure, nodes)
+        return jax.tree.unflatten(self.structure, self._nodes(free))
 
     def moved(self, free: FreeVariables) -> list[Any]:
         """Parts of the parameters that are fitted."""
-        return [b.moved(b.forward(variables)) for b, variables in zip(self.bijections, free, strict=True)]
+        return [b.moved(node) for b, node in zip(self.bijections, self._nodes(free), strict=True)]
+
+    def _nodes(self, free: FreeVariables) -> list[Any]:
+        """Value of each bijection: by one program, but for fixed ones, which it would copy."""
+        movable = [None if isinstance(b, Fixed) else b for b in self.bijections]
+        pairs = zip(self.bijections, _values(movable, free), strict=True)
+        return [b.start if isinstance(b, Fixed) else value for b, value in pairs]
 
     def reach(self, free: FreeVariables) -> FreeVariables:
         """Largest change of the free variables over which a function may be almost linear."""
@@ -69,10 +74,17 @@ class Free(eqx.Module):
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
-        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(self.moved(free))[0]:
+        shapes = eqx.filter_eval_shape(self.moved, free)
+        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(shapes)[0]:
             name = self.paths[number.idx].removeprefix("parameters") + jax.tree_util.keystr(tuple(inner))
             names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
+
+
+@eqx.filter_jit
+def _values(bijections: list[Bijection | None], free: FreeVariables) -> list[Any]:
+    pairs = zip(bijections, free, strict=True)
+    return [None if b is None else b.forward(variables) for b, variables in pairs]
 
 
 def unconstrain(
@@ -148,7 +160,7 @@ def _default(node: Any) -> PyTree:
         return ProbeGeometry(node)
     fixed = jax.tree.map(lambda _: Fixed(), node)
     if isinstance(node, TRANSFERS):
-        top = float(jnp.max(node.extinction))
+        top = float(np.max(np.asarray(node.extinction)))
         bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
         return eqx.tree_at(lambda t: (t.colors, t.extinction), fixed, bounds)
     if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`

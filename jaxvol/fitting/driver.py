@@ -11,14 +11,13 @@ from typing import Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from .._util.checks import flag, integer, not_negative, output_file
+from .._util.checks import all_finite, flag, integer, not_negative, output_file
 from .._util.progress import progress
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, strong
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where, size
 from .damping import LevenbergMarquardt
@@ -246,14 +245,14 @@ class _Run(eqx.Module):
     """Loss at the best point."""
     triangles: Triangles | None
     """Triangles at the best point."""
-    done: Array
+    done: Bool[Array | np.ndarray, ""]
     result: Any
 
     @classmethod
     def of(cls, solver: Solver, problem: Problem, y: FreeVariables) -> "_Run":
         """The state before any step."""
-        state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
-        return cls(y, state, y, y, np.asarray(np.inf), None, done, optx.RESULTS.successful)
+        state, done = _init_state(solver, problem, y), np.zeros((), bool)
+        return cls(y, state, y, y, np.asarray(np.inf), None, done, Outcome.successful)
 
     def step(self, solver: Solver, problem: Problem) -> tuple["_Run", float]:
         """The state after a step, and the loss at the solver's point."""
@@ -264,11 +263,10 @@ class _Run(eqx.Module):
 
     def ended(self, problem: Problem, losses: list[float], limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
-        finite = all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(self.y))
-        if not finite or not math.isfinite(losses[-1]):
+        if not math.isfinite(losses[-1]):
             return Outcome.nonfinite
-        if self.done or self.result != optx.RESULTS.successful:
-            return Outcome.promote(self.result)
+        if self.done or self.result != Outcome.successful:
+            return self.result
         if self.triangles is not None and self._offset(problem) <= NEAR:
             return Outcome.successful
         earlier, late = losses[: -limits.patience], losses[-limits.patience :]
@@ -281,7 +279,7 @@ class _Run(eqx.Module):
     def _offset(self, problem: Problem) -> float:
         """Distance of the best point from the minimum of the linear model: in standard errors, root mean
         square over all directions. Source: the relative offset of Bates and Watts 1981."""
-        *reducible, remainder = np.asarray(cast(Triangles, self.triangles).residual[:, -1], np.float64)
+        *reducible, remainder = np.asarray(cast(Triangles, self.triangles).residual, np.float64)[:, -1]
         freedom = problem.count - len(reducible)
         if freedom <= 0 or remainder == 0:
             return math.inf
@@ -292,7 +290,7 @@ class _Run(eqx.Module):
 def _init_state(solver: Solver, problem: Problem, y: FreeVariables) -> Any:
     with allow_promotion():
         f_struct, aux_struct = eqx.filter_eval_shape(problem, y)
-        return solver.init(problem, y, None, {}, f_struct, aux_struct, frozenset())
+        return strong(solver.init(problem, y, None, {}, f_struct, aux_struct, frozenset()))
 
 
 @eqx.filter_jit
@@ -300,8 +298,9 @@ def _advance(solver: Solver, problem: Problem, y: FreeVariables, state: Any) -> 
     with allow_promotion():
         y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
         done, result = solver.terminate(problem, y, None, {}, state, frozenset())
+    result = Outcome.where(all_finite(y), Outcome.promote(result), Outcome.nonfinite)
     # solvers with trial points return `aux` of the previous point; their state has that of the new one
-    return y, state, getattr(state, "aux", previous_aux), done, result
+    return strong((y, state, getattr(state, "aux", previous_aux), done, result))
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -42,7 +42,7 @@ class Noise(eqx.Module):
         if total == 0:
             return None
         noisy = sum(np.count_nonzero(image) for image in variances)
-        return cls(*(jnp.asarray(number, jnp.float32) for number in (total, noisy, total**2 / squares)))
+        return cls(*(jax.device_put(np.float32(number)) for number in (total, noisy, total**2 / squares)))
 
     def reduced_chi_squared(self, squares: float, numbers: int) -> float | None:
         """Reduced χ² of a residual's sum of `squares` after a fit of `numbers`; None without freedom."""
@@ -72,8 +72,9 @@ def path_traced_view(
     mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1), where var L is that of
     the mean radiance, the square of `PathTraced.standard_error`.
     """
-    arrays = traced.radiance, traced.deviations, traced.opacity[..., None], background
+    arrays = traced.radiance, traced.deviations, traced.opacity, background
     radiance, deviations, opacity, color = (np.asarray(array, np.float64) for array in arrays)
+    opacity = opacity[..., None]
     image = radiance + (1 - opacity) * color
     if traced.paths < 2:
         return image, None

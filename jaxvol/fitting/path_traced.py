@@ -23,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import Arrayable, described, integer
+from .._util.checks import Arrayable, all_finite, described, integer
 from ..path_tracing import path_trace
 from ..ray import check_arguments
 from ..scene.camera import Camera
@@ -247,6 +247,9 @@ class Averages(eqx.Module):
         return self.point - damped, covariance, loss
 
 
+_triangles = jax.jit(Triangles.of)
+
+
 class SampledRun(eqx.Module):
     """State of a fit by samples.
 
@@ -275,6 +278,7 @@ class SampledRun(eqx.Module):
     path_covariance: Float[Array, "free free"]
 
     @classmethod
+    @eqx.filter_jit
     def of(cls, problem: SampledProblem | Any, y: FreeVariables) -> "SampledRun":
         """The state before any step. `problem`: an object with the method `sample` of `SampledProblem`."""
         (flat, _), no = ravel_pytree(y), jnp.zeros((), bool)
@@ -306,24 +310,23 @@ class SampledRun(eqx.Module):
         """The state after another sample, or this one if that is not finite, and the sample's loss."""
         run = self.advanced(problem)
         # a loss may be finite where its derivative isn't
-        finite = np.all(np.isfinite(ravel_pytree(run.best)[0])) and np.isfinite(run.sampled)
+        finite = all_finite(jax.device_get((run.best, run.sampled)))
         return (run, float(run.sampled)) if finite else (self, math.nan)
 
     @property
     def triangles(self) -> Triangles:
         """Triangles of the mean residual and Jacobian of the averaged samples."""
-        rows, scores, informed = Triangles.of(self.window.rows)
-        rows, scores = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in (rows, scores))
-        return Triangles(rows, scores, informed)
+        rows, scores, informed = jax.device_get(_triangles(self.window.rows))
+        return Triangles(*jax.device_put((np.linalg.qr(rows, "r"), np.linalg.qr(scores, "r"), informed)))
 
     @property
     def settled(self) -> bool:
         """True if neither the last step nor any step to an averaged sample was shortened."""
-        return not (bool(self.cut) or self.window.cut > 0)
+        return not (bool(self.cut) or float(self.window.cut) > 0)
 
     def ratio(self, problem: SampledProblem, limits: Limits) -> float:
         """Largest ratio of standard errors, by paths over by references, beyond the tolerances."""
-        flat = np.asarray(ravel_pytree(self.best)[0], np.float64)
+        flat = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(jax.device_get(self.best))])
         by_paths = np.sqrt(np.maximum(np.diag(np.asarray(self.path_covariance, np.float64)), 0))
         spread = spreads(self.triangles, problem.count, problem.scale).unequal
         by_references = np.maximum(np.sqrt(np.sum(spread**2, axis=1)), np.finfo(float).tiny)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array
 from ..path_tracing import PathTraced
 from ..scene.camera import Camera
+from ..xla.platform import stack
 from ..xla.trees import PyTree
 from .noise import Noise, path_traced_view, pixel_values
 
@@ -46,7 +47,7 @@ class References(eqx.Module):
         for number, (camera, image, _) in enumerate(read):
             kinds.setdefault((jax.tree.structure(camera), image.shape), []).append(number)
         pairs = [[read[number][:2] for number in kind] for kind in kinds.values()]
-        groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *kind) for kind in pairs]
+        groups = [jax.tree.map(lambda *leaves: stack(leaves), *kind) for kind in pairs]
         stacked = [
             None if counted is None else jax.device_put(np.stack([counted[number] for number in kind]))
             for kind in kinds.values()

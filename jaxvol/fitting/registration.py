@@ -155,7 +155,7 @@ def register(
         stacked: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *averaged)
         pixel = min(_pixel(camera, center) for camera, *_ in averaged)
         coarse = _coarser(volume, pixel)
-        step = np.asarray(march.step) * (np.min(coarse.spacing) / np.min(volume.spacing))
+        step = np.asarray(march.step) * (np.asarray(coarse.spacing).min() / np.asarray(volume.spacing).min())
         scene = coarse, transfer, eqx.tree_at(lambda m: m.step, march, step)
         fields: Any = jax.device_put((scene, stacked, center, radius, NEAR * pixel / radius))
         level = _Level(*fields, gradient=similarity == "gradient_ncc")

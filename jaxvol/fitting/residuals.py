@@ -255,7 +255,7 @@ class Problem(eqx.Module):
         if images:
             count, total = residual.references.count, residual.references.size()
         else:
-            count = total = size(eqx.filter_eval_shape(residual, free.forward(y)))
+            count = total = size(eqx.filter_eval_shape(lambda y: cast(Any, residual)(free.forward(y)), y))
         row = (size(y) + 1) * 4
         if count == 0:
             raise ValueError("residual must return at least one number; got none.")

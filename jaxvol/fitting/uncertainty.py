@@ -13,12 +13,13 @@ parameters follows from the Jacobian of the bijections.
 import warnings
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .constraints import Free, FreeVariables
+from .constraints import Free, FreeVariables, size
 from .noise import Noise
 from .residuals import Triangles
 
@@ -108,8 +109,7 @@ def uncertainty(
     path_covariance: Float[Array, "free free"] | None = None,
 ) -> Uncertainty:
     """Uncertainty of `free.forward(at)`. `path_covariance`: part due to noise of the fit's paths."""
-    flat, unravel = ravel_pytree(at)
-    jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
+    jac = np.asarray(_jacobian(free, at), np.float64)
     unequal, equal, undetermined = spreads(triangles, count, scale)
     if path_covariance is not None:
         reach = np.asarray(ravel_pytree(free.reach(at))[0], np.float64)
@@ -125,7 +125,7 @@ def uncertainty(
     by_paths = 0.0 if path_covariance is None else jac @ np.asarray(path_covariance, np.float64) @ jac.T
 
     def covariance(spread: np.ndarray) -> np.ndarray:
-        if count <= flat.size:  # no entries are left to estimate variances from
+        if count <= size(at):  # no entries are left to estimate variances from
             return np.full((len(jac),) * 2, np.inf)
         matrix = (jac @ spread) @ (jac @ spread).T + by_paths
         matrix[touched] = matrix[:, touched] = np.nan
@@ -133,6 +133,13 @@ def uncertainty(
         return matrix
 
     return Uncertainty(covariance(unequal), names, moved, covariance(equal), chi_squared)
+
+
+@eqx.filter_jit
+def _jacobian(free: Free, at: FreeVariables) -> Float[Array, "numbers free"]:
+    """Derivatives of the fitted parts of the parameters."""
+    flat, unravel = ravel_pytree(at)
+    return jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat)
 
 
 def warn_of_misfit(noise: Noise, chi_squared: float, message: str | None) -> None:

@@ -26,7 +26,7 @@ from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
 from ..xla.linear import differentiable, moving_leaves
-from ..xla.platform import is_traced
+from ..xla.platform import in_numpy, is_traced
 from ..xla.trees import PyTree, constant, floats
 from .fixed_paths import has_step, with_constant_paths
 from .lanes import Index, walk_all
@@ -80,7 +80,8 @@ class PathTraced(eqx.Module):
         """
         if self.paths < 2:
             return jnp.full_like(self.deviations, jnp.inf)
-        return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
+        xp, (deviations,) = in_numpy(self.deviations)
+        return jnp.asarray(xp.sqrt(deviations / (self.paths * (self.paths - 1))), deviations.dtype)
 
     def image(self, background: Arrayable = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
         """Linear RGB over a background.
@@ -276,7 +277,10 @@ def _seed(key: Arrayable) -> UInt32[Array, ""]:
         elif key.shape != () or not jnp.issubdtype(key.dtype, jnp.integer):
             raise ValueError(f"key must be an integer, or a key of jax.random; got {described(key)}.")
         key = jax.random.key(key)
-    return jax.random.bits(key, (), jnp.uint32)
+    return _word(key)
+
+
+_word = jax.jit(lambda key: jax.random.bits(key, (), jnp.uint32))
 
 
 @dataclass(frozen=True)

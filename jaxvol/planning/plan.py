@@ -189,7 +189,7 @@ def plan(
     chosen, reference, tried = within.cheapest(once=once, between=between)
     unseen = 0.0
     if shows and is_empty(reference.image):
-        unseen = math.sqrt(UNSEEN / probe.source.origins[..., 0].size)
+        unseen = math.sqrt(UNSEEN / math.prod(probe.source.origins.shape[:-1]))
         tried.append(Part("visible", False, "nothing in the probed pixels, though blocks may be visible"))
     parts += tried
     ending = ()

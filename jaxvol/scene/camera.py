@@ -266,11 +266,12 @@ class Camera(eqx.Module):
             if column + width > self.size[0] or row + height > self.size[1]:
                 got = f"got left={column}, top={row}, width={width}, height={height}"
                 raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
-        x = [self._column(edge) for edge in (column, column + width)]
-        y = [self._row(edge) for edge in (row + height, row)]
-        camera = replace(self, window=jnp.stack([*x, *y]), size=(width, height), corner=None)
-        corner = self.corner + jnp.asarray([column, row], self.corner.dtype)
-        return eqx.tree_at(lambda camera: camera.corner, camera, corner)
+        xp, (view, *_) = in_numpy(self, left, top)
+        x = [view._column(edge) for edge in (column, column + width)]
+        y = [view._row(edge) for edge in (row + height, row)]
+        camera = replace(self, window=xp.stack([*x, *y]), size=(width, height), corner=None)
+        corner = view.corner + xp.asarray([column, row], self.corner.dtype)
+        return eqx.tree_at(lambda camera: camera.corner, camera, jnp.asarray(corner, self.corner.dtype))
 
     def zoom(self, factor: Arrayable, center: Arrayable = (0.5, 0.5)) -> "Camera":
         """A camera that shows 1/`factor` of the view's width and height at the same image size, in the same
@@ -345,12 +346,12 @@ class Camera(eqx.Module):
         column, row = jnp.round(self.corner).astype(jnp.int32)
         return column, row
 
-    def _column(self, column: Any) -> Scalar:
+    def _column(self, column: Any) -> Any:
         """Image-plane x of a column; integers are pixel edges."""
         low, high, _, _ = self.window
         return low + (high - low) * (column / self.size[0])
 
-    def _row(self, row: Any) -> Scalar:
+    def _row(self, row: Any) -> Any:
         _, _, bottom, top = self.window
         return top - (top - bottom) * (row / self.size[1])
 

@@ -14,6 +14,7 @@ from .._util.checks import Arrayable, described, flag, integer, not_negative
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
+from ..xla.platform import in_numpy, is_traced, stack
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
@@ -59,11 +60,12 @@ class LabelTransferFunction(Transfer):
                 "functions must count lengths in world length; got one with per_voxel=True. Pass a "
                 "unit_distance, such as the volume: jv.colormap(..., unit_distance=volume)."
             )
-        hidden = TransferFunction(visible[0].values, 0 * visible[0].colors, 0 * visible[0].extinction)
+        n = visible[0].values.shape[0]
+        hidden = TransferFunction(visible[0].values, np.zeros((n, 3)), np.zeros(n))
         complete = [hidden if function is None else function for function in [*by_label, None]]
         self.stacked = _stacked(complete)
-        self.opacity = jnp.asarray(np.ones(len(complete)), self.stacked.extinction.dtype)
-        self.shown = jnp.asarray(np.ones(len(complete)), bool)
+        self.opacity = jnp.asarray(np.ones(len(complete), dtype := self.stacked.extinction.dtype), dtype)
+        self.shown = jnp.asarray(np.ones(len(complete), bool), bool)
 
     def with_visibility(self, visible: Mapping[Any, bool | np.bool_ | Array]) -> "LabelTransferFunction":
         """A copy with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
@@ -74,7 +76,7 @@ class LabelTransferFunction(Transfer):
         result = self.shown
         for label, shown in self._changes("visible", visible):
             is_array = isinstance(shown, jax.Array) and shown.shape == () and shown.dtype == bool
-            result = result.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
+            result = _with_entry(result, label, shown if is_array else flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, result)
 
     def with_opacity(self, opacity: Mapping[Any, Arrayable]) -> "LabelTransferFunction":
@@ -89,8 +91,7 @@ class LabelTransferFunction(Transfer):
         """
         result = self.opacity
         for label, factor in self._changes("opacity", opacity):
-            factor = not_negative(f"opacity[{label}]", factor)
-            result = result.at[label].set(factor.astype(result.dtype))
+            result = _with_entry(result, label, not_negative(f"opacity[{label}]", factor))
         return eqx.tree_at(lambda transfer: transfer.opacity, self, result)
 
     def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
@@ -187,17 +188,26 @@ def _by_label(functions: Any) -> list[TransferFunction | None]:
     return list(functions)
 
 
-@jax.jit
+def _with_entry(array: Array, label: int, entry: Array | bool) -> Array:
+    """The array with another entry; by NumPy, which compiles nothing, if both are concrete."""
+    if is_traced(array, entry):
+        return array.at[label].set(jnp.asarray(entry, array.dtype))
+    changed = np.array(array)
+    changed[label] = entry
+    return jnp.asarray(changed, array.dtype)
+
+
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:
     """The functions along a leading axis, padded to the same number of points with copies of the last one."""
     points = max(function.values.shape[0] for function in functions)
+    xp, functions = in_numpy(*functions)
 
     def continued(function: TransferFunction) -> TransferFunction:
         values, missing = function.values, points - function.values.shape[0]
         # far enough apart to differ in the float type
-        gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
-        beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
-        padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, *[leaf[-1:]] * missing]), function)
-        return eqx.tree_at(lambda f: f.values, padded, jnp.concatenate([values, beyond]))
+        gap = xp.maximum(values[-1] - values[0], xp.maximum(abs(values[-1]), 1))
+        beyond = values[-1] + gap * xp.arange(1, missing + 1, dtype=values.dtype)
+        padded = jax.tree.map(lambda leaf: xp.concatenate([leaf, *[leaf[-1:]] * missing]), function)
+        return eqx.tree_at(lambda f: f.values, padded, xp.concatenate([values, beyond]))
 
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(continued, functions))
+    return jax.tree.map(lambda *leaves: stack(leaves), *map(continued, functions))

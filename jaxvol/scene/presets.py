@@ -153,7 +153,7 @@ def colormap(
     n_colors = integer("n_colors", n_colors, 2)
     colors = _display_colors(cmap, np.linspace(0, 1, n_colors))
     low, high = _range(clim)
-    linear = from_srgb(jnp.asarray(colors, dtype=float))
+    linear = from_srgb(colors)
     values, per_voxel = np.linspace(low, high, n_colors), unit_distance is None
     extinction = extinction_of(_ramp(opacity, n_colors), 1.0 if unit_distance is None else unit_distance)
     return TransferFunction(values, linear, extinction, per_voxel=per_voxel)
@@ -181,12 +181,12 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
     return np.stack([np.interp(at, np.linspace(0, 1, len(rgb)), channel) for channel in rgb.T], axis=-1)
 
 
-def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:
+def _ramp(opacity: Any, n: int) -> Float[Array | np.ndarray, " n"]:
     if isinstance(opacity, str):
         ramps = {"linear": np.linspace(0, 1, n), "sigmoid": 1 / (1 + np.exp(-np.linspace(-10, 10, n)))}
         if opacity not in ramps:
             raise ValueError(f'opacity must be "linear", "sigmoid" or an array; got {opacity!r}.')
-        return jnp.asarray(ramps[opacity], dtype=float)
+        return ramps[opacity]
     opacities = unit_interval("opacity", opacity, (None,))
     if opacities.shape[0] < 2:
         raise ValueError(f"opacity must hold at least 2 values; got {opacities.shape[0]}.")

@@ -189,7 +189,7 @@ class Rendering(eqx.Module):
 
 
 def _warn_if_empty(rendering: Rendering) -> None:
-    if not np.asarray(rendering.opacity).any():  # NaN is not nothing
+    if not np.asarray(rendering.rgba)[..., -1].any():  # NaN is not nothing
         causes = "does the camera see the volume, and the transfer function show its values?"
         warning = f"nothing is visible, all pixels are transparent: {causes} jaxvol.show says why."
         warnings.warn(warning, stacklevel=4)  # the caller of a method, which equinox wraps

@@ -22,7 +22,7 @@ from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
-from ..xla.platform import is_traced
+from ..xla.platform import in_numpy, is_traced
 from ..xla.trees import is_none
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index, nearest_node
 
@@ -126,7 +126,7 @@ class Volume(eqx.Module):
             return eqx.tree_pformat(self)
         data, place = np.asarray(self.data), ("spacing", "origin", "direction")
         parts = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
-        parts += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        parts += [] if self.labels is None else [f"labels to {np.asarray(self.labels).max()}"]
         parts += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
         return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(parts)}>"
 
@@ -244,16 +244,21 @@ class Volume(eqx.Module):
     @property
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
-        turn = np.eye(3, dtype=self.spacing.dtype) if self.direction is None else self.direction
-        return _bounds(self.origin, turn, self.spacing, self._steps)
+        xp, (origin, spacing, turn) = in_numpy(self.origin, self.spacing, self.direction)
+        turn = np.eye(3, dtype=spacing.dtype) if turn is None else turn
+        # extent of each axis of the data along the world's axes
+        reach = turn * (self._steps * spacing)[None, :]
+        ends = (origin + xp.sum(end(reach, 0), axis=1) for end in (xp.minimum, xp.maximum))
+        return jnp.asarray(xp.stack(list(ends), axis=-1).reshape(-1), self.origin.dtype)
 
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
-        diagonal = self._steps * self.spacing
-        if self.direction is not None:  # no matrix product, which some GPUs round to 10 bits
-            diagonal = jnp.sum(self.direction * diagonal[None, :], axis=1)
-        return self.origin, self.origin + diagonal
+        xp, (origin, spacing, turn) = in_numpy(self.origin, self.spacing, self.direction)
+        diagonal = self._steps * spacing
+        if turn is not None:  # no matrix product, which some GPUs round to 10 bits
+            diagonal = xp.sum(turn * diagonal[None, :], axis=1)
+        return self.origin, jnp.asarray(origin + diagonal, self.origin.dtype)
 
     @property
     def _steps(self) -> Float[np.ndarray, "3"]:
@@ -263,8 +268,8 @@ class Volume(eqx.Module):
     @property
     def center(self) -> Float[Array, "3"]:
         """World position of the center of the grid."""
-        low, high = self.corners
-        return (low + high) / 2
+        _, (low, high) = in_numpy(*self.corners)
+        return jnp.asarray((low + high) / 2, self.origin.dtype)
 
     def value(self, coordinate: Vec3) -> Voxel:
         """Value, or a tuple of channels, at a grid coordinate, in its float type; from `field` if set."""
@@ -402,15 +407,3 @@ def fetches_of(volume: Volume) -> list[Fetch]:
 
 def _index(bound: Any) -> int | None:
     return None if bound is None else operator.index(bound)
-
-
-@jax.jit
-def _bounds(
-    origin: Float[Array, "3"],
-    turn: Float[Array, "3 3"],
-    spacing: Float[Array, "3"],
-    steps: Float[Array, "3"],
-) -> Float[Array, "6"]:
-    reach = turn * (steps * spacing)[None, :]  # of each axis of the data along the world's axes
-    ends = (origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
-    return jnp.stack(list(ends), axis=-1).reshape(-1)

@@ -1,7 +1,7 @@
 """Platform of a program, and loops for it. On a GPU, the host waits for the device at each branch, and at
 each turn of a loop of unknown length, since XLA copies the predicate to the host."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -63,3 +63,9 @@ def is_traced(*values: Any) -> bool:
 def in_numpy(*values: Any) -> tuple[Any, Any]:
     """`numpy` and the values as its arrays if they are concrete; else `jax.numpy` and the values."""
     return (jnp, values) if is_traced(*values) else (np, jax.tree.map(np.asarray, values))
+
+
+def stack(leaves: Sequence[Array | np.ndarray | np.generic]) -> Array:
+    """`jnp.stack`, which compiles no program if the arrays are concrete."""
+    xp, leaves = in_numpy(*leaves)
+    return jnp.asarray(xp.stack(leaves), leaves[0].dtype)

@@ -39,7 +39,7 @@ def test_any_real_number_is_allowed_and_forward_undoes_inverse(case):
     known = inverse(bijection, np.float32(values))
     assert np.all(np.isfinite(known))
     free = np.concatenate([known, np.linspace(-80, 80, 27, dtype=np.float32)])
-    value, slope = with_slopes(bijection, free)
+    value, slope = map(np.asarray, with_slopes(bijection, free))
     np.testing.assert_allclose(value[:5], values, rtol=2e-6)
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope) & (slope >= 0))
@@ -75,7 +75,7 @@ def test_any_step_of_an_optimiser_keeps_parameters_within_bounds():
         return constrain(free)["glow"], jax.tree.leaves(slope)[0], after["glow"]
 
     start = np.array([0.2, 3.0], np.float32)
-    begun, slope, after = stepped(start)
+    begun, slope, after = map(np.asarray, stepped(start))
     np.testing.assert_allclose(begun, start, rtol=1e-5)
     # of a value v = scale · softplus(free), it is scale · (1 - exp(-v / scale))
     np.testing.assert_allclose(slope, 2 * (1 - np.exp(-start / 2)), rtol=1e-5)
@@ -142,7 +142,7 @@ def camera():
 
 def test_a_pose_is_a_rigid_motion_that_can_be_undone(camera):
     pose = jv.Pose(camera)
-    free = {"rotation": jnp.asarray([0.2, -0.5, 0.9]), "translation": jnp.asarray([0.1, 0.3, -0.2])}
+    free = {"rotation": np.float32([0.2, -0.5, 0.9]), "translation": np.float32([0.1, 0.3, -0.2])}
     there, rays = moved(pose, free)
     arms = [np.asarray(c.position) - np.asarray(c.focal_point) for c in (camera, there)]
     assert np.linalg.norm(arms[1]) == pytest.approx(np.linalg.norm(arms[0]), rel=1e-6)

@@ -21,7 +21,7 @@ from jaxvol.fitting.constraints import Free
 from jaxvol.fitting.residuals import Problem
 from jaxvol.metrics import psnr
 
-from ..scenes import RESOLUTION, SIZE, soft_transfer
+from ..scenes import RESOLUTION, SIZE, rendered, soft_transfer
 
 
 WIDTH, HEIGHT = SIZE
@@ -47,7 +47,7 @@ def seen(transfer, view):
 
 
 def image(transfer, direction):
-    return np.asarray(jv.render(*seen(transfer, camera(direction))).image())
+    return np.asarray(rendered(*seen(transfer, camera(direction))).image())
 
 
 @cache
@@ -125,7 +125,7 @@ def test_a_direction_that_nothing_shows_is_named():
         assert uncertainty.standard_errors[name] == np.inf
     for name in (".extinction[3]", ".colors[3, 0]", ".extinction[6]"):
         assert np.isfinite(uncertainty.standard_errors[name])
-    assert np.array_equal(result.parameters.extinction[7:], GREY.extinction[7:])
+    assert np.array_equal(np.asarray(result.parameters.extinction)[7:], np.asarray(GREY.extinction)[7:])
 
 
 def test_parameters_and_covariance_are_those_of_scipy():
@@ -133,7 +133,7 @@ def test_parameters_and_covariance_are_those_of_scipy():
     result, ((top, rate), covariance) = fitted(), independent()
     assert result.success, result.message
     assert float(result.parameters["top"]) == pytest.approx(top, rel=1e-3)
-    assert float(result.parameters["rate"][0]) == pytest.approx(rate, rel=1e-3)
+    np.testing.assert_allclose(result.parameters["rate"], [rate], rtol=1e-3)
     assert result.uncertainty is not None
     assert result.uncertainty.names == ["['rate'][0]", "['top']"]
     equal = result.uncertainty.covariance_of_equal_noise
@@ -164,7 +164,7 @@ def test_every_solver_finds_the_same_curve(solver):
     (top, rate), _ = independent()
     close = 2e-2 if solver == "adam" else 1e-3
     assert float(result.parameters["top"]) == pytest.approx(top, rel=close)
-    assert float(result.parameters["rate"][0]) == pytest.approx(rate, rel=close)
+    np.testing.assert_allclose(result.parameters["rate"], [rate], rtol=close)
     assert (result.uncertainty is None) == (solver in ("bfgs", "adam"))
 
 
@@ -294,11 +294,12 @@ def test_what_is_free_and_how_by_default():
         "['t'].extinction": "Positive",
         "['v'].data": "Unconstrained",
     }
-    assert np.all(eqx.filter_jit(free.forward)(y)["t"].extinction > 0)
+    assert np.all(np.asarray(free.forward(y)["t"].extinction) > 0)
 
 
 def test_where_and_constraints_choose_what_is_free():
-    parameters = {"transfer": TRUTH, "gain": jnp.ones(2), "name": "head", "count": 3}
+    gain = jax.device_put(np.ones(2, np.float32))
+    parameters = {"transfer": TRUTH, "gain": gain, "name": "head", "count": 3}
     free, y = Free.of(parameters, None, lambda p: (p["transfer"].extinction, p["gain"]))
     assert [leaf.shape for leaf in jax.tree.leaves(y)] == [(2,), (8,)]
     back = free.forward(y)
@@ -411,7 +412,7 @@ def test_a_derivative_that_leads_uphill_stalls():
         return p - 3.0
 
     f.defjvp(lambda primal, tangent: (f(*primal), -tangent[0]))
-    result = jv.fit(f, jnp.asarray([1.0]), max_steps=60)
+    result = jv.fit(f, np.ones(1, np.float32), max_steps=60)
     assert not result.success
     assert "No step lowered the loss" in result.message
     np.testing.assert_allclose(result.parameters, [1], atol=1e-6)
@@ -419,26 +420,26 @@ def test_a_derivative_that_leads_uphill_stalls():
 
 def test_what_diverges_gives_back_the_best_seen():
     """From 2, Gauss–Newton steps on the arctangent diverge, each farther than the one before."""
-    result = jv.fit(jnp.arctan, jnp.asarray([2.0]), solver="gauss_newton", max_steps=50)
+    result = jv.fit(jnp.arctan, np.float32([2]), solver="gauss_newton", max_steps=50)
     assert not result.success
     assert result.message
-    assert float(result.parameters[0]) == 2
+    assert np.asarray(result.parameters) == 2
     assert result.loss == pytest.approx(float(np.arctan(2) ** 2 / 2))
 
 
 def test_a_loss_that_is_not_finite_ends_a_fit():
     optax = pytest.importorskip("optax", reason="pip install -e '.[fit]'")
-    result = jv.fit(jnp.log, jnp.asarray([4.0]), solver=optax.sgd(15.0), max_steps=50)
+    result = jv.fit(jnp.log, np.float32([4]), solver=optax.sgd(15.0), max_steps=50)
     assert result.solution.result == Outcome.nonfinite
     assert "Nonfinite" in result.message
-    assert float(result.parameters[0]) == 4
+    assert np.asarray(result.parameters) == 4
 
 
 def test_a_step_to_where_the_residual_is_not_finite_is_taken_back():
     """One parameter for one residual: its variance remains unknown."""
-    result = jv.fit(lambda p: jnp.sqrt(p) - 0.1, jnp.asarray([4.0]), max_steps=50)
+    result = jv.fit(lambda p: jnp.sqrt(p) - 0.1, np.float32([4]), max_steps=50)
     assert result.success
-    assert float(result.parameters[0]) == pytest.approx(0.01, rel=1e-3)
+    np.testing.assert_allclose(result.parameters, [0.01], rtol=1e-3)
     assert result.uncertainty is not None
     assert np.all(result.uncertainty.covariance == np.inf)
 
@@ -451,7 +452,7 @@ def test_a_fit_to_noise_ends_at_the_minimum():
     def residual(rate):
         return jnp.exp(-rate * x) - noisy
 
-    fit = jv.fit(residual, jnp.float32(1.0))
+    fit = jv.fit(residual, np.float32(1))
     assert fit.success
     assert len(fit.losses) <= 8
     exact = least_squares(lambda rate: np.exp(-rate * x) - noisy, 1.0, xtol=1e-12).x[0]

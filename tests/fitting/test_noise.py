@@ -3,7 +3,7 @@
 import warnings
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -64,16 +64,16 @@ def traced(paths: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, jv.PathTr
     radiance = met[..., None] * rng.exponential(size=(4, 6, paths, 3))
     mean = radiance.mean(axis=2)
     deviations = np.sum((radiance - mean[:, :, None]) ** 2, axis=2)
-    arrays = (jnp.asarray(each, jnp.float32) for each in (mean, met.mean(axis=2), deviations))
-    image: Any = (*arrays, jnp.zeros((4, 6), bool), paths, jnp.uint32(0))
-    return radiance, met, jv.PathTraced(*image)
+    arrays = (part.astype(np.float32) for part in (mean, met.mean(axis=2), deviations))
+    image: Any = jax.device_put((*arrays, np.zeros((4, 6), bool), np.uint32(0)))
+    return radiance, met, jv.PathTraced(*image[:4], paths, image[4])
 
 
 def test_the_noise_of_a_path_traced_image_is_that_of_its_paths_over_the_background():
     radiance, met, image = traced(32)
     for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.2)):
         of_paths = radiance + (1 - met[..., None]) * np.asarray(background)
-        found, variance = path_traced_view(image, jnp.asarray(background, jnp.float32))
+        found, variance = path_traced_view(image, jax.device_put(np.float32(background)))
         np.testing.assert_allclose(found, of_paths.mean(axis=2), rtol=1e-5)
         assert variance is not None
         np.testing.assert_allclose(variance, of_paths.var(axis=2, ddof=1) / 32, rtol=1e-4)
@@ -151,14 +151,14 @@ def test_standard_errors_are_those_of_many_parameters_beside_a_background():
     """Of a linear model of 90 entries and 40 parameters, and 600 entries that depend on none."""
     random = np.random.default_rng(0)
     jacobian = np.concatenate([random.normal(size=(90, 40)), np.zeros((600, 40))])
-    project = np.linalg.pinv(jacobian)
+    project, triangles = np.linalg.pinv(jacobian), jax.jit(Triangles.of)
     off = []
     for _ in range(200):
         noise = random.normal(0, 0.01, 690)
         found = project @ noise
         rows = np.concatenate([jacobian, (noise - jacobian @ found)[:, None]], axis=1)[:, None]
-        residual, scores, informed = Triangles.of(jnp.asarray(rows, jnp.float32))
+        residual, scores, informed = triangles(rows.astype(np.float32))
         both = (np.linalg.qr(np.asarray(matrix), "r") for matrix in (residual, scores))
-        spread = spreads(Triangles(*map(jnp.asarray, both), informed), 690, 1.0).unequal
+        spread = spreads(Triangles(*jax.device_put((*both, informed))), 690, 1.0).unequal
         off.append(found / np.linalg.norm(spread, axis=1))
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1, abs=0.08)

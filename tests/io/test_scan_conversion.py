@@ -81,7 +81,7 @@ def of_nines(grid, probe=PROBE):
 def test_nodes_on_the_faces_are_inside():
     """The middle beam begins at depth 0 and ends at 60: z from 50 to 110."""
     found = of_nines((("spacing", 6.0), ("origin", (0.0, 0.0, 44.0))))
-    np.testing.assert_array_equal(found.data[0, 0], [7, *[9] * 11, *[7] * 10])
+    np.testing.assert_array_equal(np.asarray(found.data)[0, 0], [7, *[9] * 11, *[7] * 10])
 
 
 def test_behind_the_apex_and_the_axis_there_is_nothing():

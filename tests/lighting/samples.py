@@ -46,8 +46,7 @@ def colors_of(lighting, volume, transfer, points, transmittance=1.0, pixels=None
     points = np.resize(np.asarray(points, np.float32), (64, 3))
     pixels = np.resize(np.asarray([(0, 0)] if pixels is None else pixels, np.int32), (64, 2))
     transmittance = np.resize(np.float32(transmittance), 64)
-    given = (jnp.asarray(each) for each in (points, transmittance, pixels))
-    return np.asarray(program(lighting, volume, transfer, *given))[:count]
+    return np.asarray(program(lighting, volume, transfer, points, transmittance, pixels))[:count]
 
 
 def check_gradient(value_and_gradient, scene, leaves, *, step, rtol, atol=0.0, least=0.0):
@@ -60,7 +59,7 @@ def check_gradient(value_and_gradient, scene, leaves, *, step, rtol, atol=0.0, l
 
         def value(sign, where=where, moved=leaf, along=along):
             return float(
-                value_and_gradient(eqx.tree_at(where, scene, jnp.asarray(moved + sign * step * along)))[0]
+                value_and_gradient(eqx.tree_at(where, scene, jax.device_put(moved + sign * step * along)))[0]
             )
 
         expected = (value(1) - value(-1)) / (2 * step)
@@ -86,5 +85,5 @@ def image_of_reference(volume, transfer, camera, march, lighting):
 def in_double(scene):
     """With float64 leaves, voxels among them. Made where 64-bit types are enabled."""
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array(leaf) else leaf, scene
+        lambda leaf: jax.device_put(np.asarray(leaf, float)) if eqx.is_inexact_array(leaf) else leaf, scene
     )

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -33,7 +32,15 @@ VOLUME, TRANSFER = (
     jv.Volume(np.zeros((9, 9, 9), np.float32)),
     jv.colormap("gray", (0.0, 1.0), unit_distance=1.0),
 )
-PAIR = ScattererTemplate(jnp.zeros((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
+
+
+def photons(place):
+    """Two photons at this place along all axes."""
+    offset, intensity = np.full((1, 1, 2, 3), place, np.float32), np.ones((1, 1, 2), np.float32)
+    return ScattererTemplate(*jax.device_put((offset, intensity)))
+
+
+PAIR = photons(0)
 
 
 def grown(material=HALF, **how):
@@ -47,8 +54,7 @@ def lit(materials: Any = HALF, lights: Any = SUN, **how):
 def render_far_away():
     volume = jv.Volume(np.zeros((4, 4, 4), np.float32), (0.05,) * 3, (615_840.0, 5_846_926.0, 758.0))
     camera = jv.Camera.looking_at(volume, size=(2, 2))
-    away = ScattererTemplate(jnp.ones((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
-    jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=away)())
+    jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=photons(1))())
 
 
 def render_colors(lighting):
@@ -129,7 +135,7 @@ BAD = {
     "labels": (
         lambda: jax.eval_shape(
             lambda points: shaded(lit(Material(0.5, 1.0, label=1), given=PAIR)(), VOLUME, TRANSFER, points),
-            jnp.zeros((1, 3)),
+            np.zeros((1, 3), np.float32),
         ),
         "labels are needed here",
     ),
@@ -193,7 +199,7 @@ def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
 
 def test_light_by_transport_is_read_at_any_distance():
     assert lit(form="transport")().farthest_read is None
-    farthest = lit(given=jax.tree.map(jnp.ones_like, PAIR))().farthest_read
+    farthest = lit(given=photons(1))().farthest_read
     assert farthest is not None
     assert 0 < farthest < np.inf
 

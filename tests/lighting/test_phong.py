@@ -17,7 +17,7 @@ from jaxvol.lighting import DirectionalLight, HeadLight, Phong, PointLight
 from jaxvol.lighting.shading import Shader
 from jaxvol.scene.space import Affine, world_gradient
 
-from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, slow
+from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, rendered, slow
 from .samples import check_gradient, image_of_reference, in_double, sample_at, surroundings
 
 
@@ -61,7 +61,7 @@ def test_the_gradient_is_interpolated_between_central_differences(kind, shape):
     stored = slopes_of(volume) is not None
     assert stored == (kind in ("uint8", "int8"))
     for each in (volume, accelerated(volume)) if stored else (volume,):
-        np.testing.assert_allclose(gradients(each, jnp.asarray(at)), expected, atol=2e-3)
+        np.testing.assert_allclose(gradients(each, at), expected, atol=2e-3)
 
 
 def test_slopes_are_stored_for_those_who_read_them():
@@ -73,7 +73,7 @@ def test_slopes_are_stored_for_those_who_read_them():
 def normals(volume, space, points):
     """Unit gradients at world points."""
     gradient = jax.jit(jax.vmap(lambda point: jnp.stack(world_gradient(volume, space, apart(point)))))
-    found = np.asarray(gradient(jnp.asarray(points, jnp.float32)))
+    found = np.asarray(gradient(np.float32(points)))
     return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
@@ -88,7 +88,7 @@ def test_normals_are_those_of_the_world_under_a_toroidal_map():
     to_world = jax.jit(jax.vmap(lambda c: jnp.stack(space.point(apart(c)))))
     ramp = np.array([0.5, -0.7, 0.4]) / np.linalg.norm([0.5, -0.7, 0.4])
     nodes = np.indices(shape).reshape(3, -1).T.astype(np.float32)
-    points = np.asarray(to_world(jnp.asarray(nodes)))
+    points = np.asarray(to_world(nodes))
     volume = jv.Volume((points @ ramp).astype(np.float32).reshape(shape))
     inner = points.reshape(*shape, 3)[3:-3:7, 3:-3:7, 3:-3:7].reshape(-1, 3) + 0.1
     assert np.max(angles(normals(volume, space, inner), ramp[None])) < 0.5
@@ -128,7 +128,7 @@ def all_slopes(scene, viewer):
 
 def color_of(lighting, gradient, viewer):
     scene = of_gradient(gradient), lighting
-    return np.asarray(all_slopes(scene, jnp.asarray(viewer, jnp.float32))[0][1])
+    return np.asarray(all_slopes(scene, np.float32(viewer))[0][1])
 
 
 def by_formula(normal, viewer, lights, power=10.0):
@@ -164,7 +164,7 @@ def test_a_plane_that_faces_the_head_light_has_vtks_colour_whatever_the_length_o
 
 def test_without_a_gradient_there_is_ambient_light_and_no_derivative():
     scene = of_gradient((0, 0, 0)), Phong(LIGHTS["all"])
-    (_, color), (slope, _) = all_slopes(scene, jnp.asarray([0.0, 0.0, 1.0]))
+    (_, color), (slope, _) = all_slopes(scene, np.float32([0, 0, 1]))
     np.testing.assert_allclose(color, 0.1 * COLOR, rtol=1e-6)
     np.testing.assert_array_equal(slope.data, 0)
 
@@ -187,7 +187,7 @@ OF_SAMPLES = {
 def test_gradients_of_a_sample_match_central_differences():
     """Slow tests below are of images."""
     with in_float64():
-        viewer = jnp.asarray(VIEWS[1])
+        viewer = jax.device_put(np.asarray(VIEWS[1], float))
         lights = HeadLight(), DirectionalLight(-VIEWS[0]), PointLight(POINT + 2 * VIEWS[1], (3.0, 4.0, 5.0))
         scene = in_double((of_gradient(0.7 * unit(0.2, -0.1, 1)), Phong(lights)))
 
@@ -238,8 +238,8 @@ LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ea
 )
 def test_images_are_those_of_the_reference(transforms, kind, light, quadrature):
     scene, lighting = scene_of(transforms, kind, quadrature), Phong(LIGHTS[light])
-    found = jv.render(*scene, lighting=lighting)
-    assert found.rgba[..., :3].max() > 0.1
+    found = rendered(*scene, lighting=lighting)
+    assert np.asarray(found.rgba)[..., :3].max() > 0.1
     np.testing.assert_allclose(found.rgba, image_of_reference(*scene, lighting), atol=2e-5)
 
 

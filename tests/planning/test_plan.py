@@ -137,7 +137,7 @@ def test_bad_input_is_named(case):
         call()
 
 
-FULL = jv.Volume(0.3 + 0.5 * SPHERE.data, SPHERE.spacing, SPHERE.origin)
+FULL = jv.Volume(np.float32(0.3) + np.float32(0.5) * np.asarray(SPHERE.data), SPHERE.spacing, SPHERE.origin)
 CLIP = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
 # how a scene is planned, how it is rendered, and whether blocks hold nothing that shows
 SCENES: dict[str, tuple[dict[str, Any], dict[str, Any], bool]] = {

@@ -158,7 +158,7 @@ def refused() -> dict[str, tuple[Any, str]]:
     volume, transfer = of_nine(np.float32)
     camera, march = jv.Camera.looking_at(volume, size=(4, 4)), jv.March(0.5)
     light, of_three = jv.lighting.Phong(), jv.TransferFunction((0, 1), np.ones((2, 3)), (0, 1))
-    image = jv.Rendering(jnp.ones((4, 4, 10)), jnp.zeros((4, 4), bool))
+    image = jv.Rendering(*jax.device_put((np.ones((4, 4, 10), np.float32), np.zeros((4, 4), bool))))
     returns = r"Odd.classifier must return \(\(c1, c2, \.\.\.\), extinction\).* got "
     return {
         "no colours": (lambda: jv.render(volume, Odd(((), 1.0)), camera, march), returns),

@@ -13,7 +13,7 @@ def test_the_chosen_ones_are_in_front_and_in_order():
     for shape, shares in (((3, 5), [0.5]), ((8, 700), [0.1, 1.0, 0.0])):
         for share in shares:
             masks = np.random.default_rng(0).random((2, *shape)) < share
-            number, indices = chosen_of(masks)
+            number, indices = map(np.asarray, chosen_of(masks))
             expected = np.flatnonzero(masks)
             assert number == len(expected)
             np.testing.assert_array_equal(indices[: len(expected)], expected)

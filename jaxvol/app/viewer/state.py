@@ -290,7 +290,7 @@ def initial(
     color: Any = tuple(np.asarray(linear_color("background", background)).tolist())
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = Place.of(initial_march, volume).voxel(blocks)
-    finest = min([voxel, *(float(np.min(added.spacing)) for added, _ in pairs)])
+    finest = min([voxel, *(float(np.asarray(added.spacing).min()) for added, _ in pairs)])
     step = max(0.5 * finest / voxel, MIN_STEP) if march is None else float(march.step) / voxel
     if not MIN_STEP <= step <= MAX_STEP:
         raise ValueError(

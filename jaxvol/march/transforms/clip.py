@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, Flag, finite_array, flag, require, shortened
 from ..._util.vec3 import Scalar, Vec3, apart, dot, minus
 from ...scene.occupancy import BLOCK, Occupancy
 from ...scene.space import Gap, Path, Space
+from ...xla.platform import stack
 from ..march import Transform
 
 
@@ -244,5 +246,6 @@ def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes
         origins.append(finite_array(f"the origin of planes[{i}]", origin, (3,)))
         normals.append(require(normal, lambda normal: abs(normal).max() > 0, message))
     if not pairs:
-        return jnp.zeros((0, 3)), jnp.zeros((0, 3))
-    return jnp.stack(origins), jnp.stack(normals)
+        none = finite_array("planes", np.zeros((0, 3)), (0, 3))
+        return none, none
+    return stack(origins), stack(normals)

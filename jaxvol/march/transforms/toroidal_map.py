@@ -24,6 +24,7 @@ from ..._util.vec3 import Scalar, Vec3, apart
 from ...scene.occupancy import BLOCK, Occupancy
 from ...scene.space import Gap, Space, blocks_in_reach
 from ...scene.volume import Volume
+from ...xla.platform import in_numpy, stack
 from ..march import Transform
 from .sector_faces import SectorFaces, hypot
 
@@ -99,30 +100,34 @@ class ToroidalMap(Transform):
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Lowest and highest world coordinates of the swept sector; tight."""
         # depth and angles are separable: extremes lie at the ends of the ranges, or in the middle of angles
-        angles = (ends - math.pi / 2 for ends in (self.sigma_range, self.beta_range))
-        fan, turn = (jnp.append(ends, jnp.clip(0.0, *ends)) for ends in angles)
-        depth = self.b + self.gamma_range
-        x = jnp.outer(depth, jnp.sin(fan))
-        rho = self.a + jnp.outer(depth, jnp.cos(fan))
-        rho = jnp.maximum(jnp.stack([rho.min(), rho.max()]), 0)
-        y, z = jnp.outer(rho, jnp.sin(turn)), jnp.outer(rho, jnp.cos(turn))
-        return jnp.stack([x.min(), y.min(), z.min()]), jnp.stack([x.max(), y.max(), z.max()])
+        xp, (probe,) = in_numpy(self)
+        angles = (ends - math.pi / 2 for ends in (probe.sigma_range, probe.beta_range))
+        fan, turn = (xp.append(ends, xp.clip(xp.zeros((), ends.dtype), *ends)) for ends in angles)
+        depth = probe.b + probe.gamma_range
+        x = xp.outer(depth, xp.sin(fan))
+        rho = probe.a + xp.outer(depth, xp.cos(fan))
+        rho = xp.maximum(xp.stack([rho.min(), rho.max()]), 0)
+        axes = x, xp.outer(rho, xp.sin(turn)), xp.outer(rho, xp.cos(turn))
+        low, high = stack([axis.min() for axis in axes]), stack([axis.max() for axis in axes])
+        return low, high
 
     @property
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the swept sector; tight."""
-        return jnp.stack(self.corners, axis=-1).reshape(-1)
+        xp, ends = in_numpy(*self.corners)
+        return jnp.asarray(xp.stack(ends, axis=-1).reshape(-1), self.a.dtype)
 
     @property
     def center(self) -> Float[Array, "3"]:
-        low, high = self.corners
-        return (low + high) / 2
+        _, (low, high) = in_numpy(*self.corners)
+        return jnp.asarray((low + high) / 2, self.a.dtype)
 
     @property
     def nearest_to_axis(self) -> Float[Array, ""]:
         """ρ of the sample nearest to the motor axis, world length; negative if it lies behind the axis."""
-        depth = self.b + self.gamma_range[0]
-        return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
+        xp, (probe,) = in_numpy(self)
+        depth = probe.b + probe.gamma_range[0]
+        return jnp.asarray(xp.asarray(probe.a + depth * xp.min(xp.sin(probe.sigma_range))), self.a.dtype)
 
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:

@@ -317,7 +317,8 @@ def controlled(monkeypatch):
 def test_the_controls_change_the_points_that_they_show(controlled):
     """By presses on the curve, of values from 22 to 200 and heights that are square roots of opacities."""
     model, controls = controlled()
-    low, high = float(np.min(BALL.data)), float(np.max(BALL.data))
+    data = np.asarray(BALL.data)
+    low, high = float(data.min()), float(data.max())
 
     def press(gesture, part, value, opacity, *, twice="false"):
         x, y = (value - low) / (high - low), 1 - math.sqrt(opacity) * 108 / 110
@@ -436,7 +437,8 @@ def test_a_box_and_a_plane_clip_what_is_shown(controlled):
     assert isinstance(clip, jv.Clip)
     assert clip.box is not None
     np.testing.assert_allclose(clip.box, (3, 9, *np.asarray(BALL.bounds)[2:]))
-    np.testing.assert_allclose((clip.origins[0], clip.normals[0]), (BALL.center, -orbit.toward), rtol=1e-5)
+    plane = np.concatenate([clip.origins, clip.normals])
+    np.testing.assert_allclose(plane, (BALL.center, -orbit.toward), rtol=1e-5)
     for depth in (-1.0, 1.0):  # from nothing to all
         controls["depth"].set(depth)
         origin, normal = model.scene.plane(model.state)
