@@ -298,7 +298,7 @@ def _advance(solver: Solver, problem: Problem, y: FreeVariables, state: Any) -> 
     with allow_promotion():
         y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
         done, result = solver.terminate(problem, y, None, {}, state, frozenset())
-    result = Outcome.where(all_finite(y), Outcome.promote(result), Outcome.nonfinite)
+    result = Outcome.where(all_finite(y), Outcome.promote(result), cast(Any, Outcome.nonfinite))
     # solvers with trial points return `aux` of the previous point; their state has that of the new one
     return strong((y, state, getattr(state, "aux", previous_aux), done, result))
 

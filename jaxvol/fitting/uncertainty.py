@@ -19,7 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .constraints import Free, FreeVariables, size
+from .constraints import Free, FreeVariables
 from .noise import Noise
 from .residuals import Triangles
 
@@ -114,7 +114,7 @@ def uncertainty(
     if path_covariance is not None:
         reach = np.asarray(ravel_pytree(free.reach(at))[0], np.float64)
         hidden = np.diag(np.asarray(path_covariance, np.float64)) > reach**2
-        undetermined = np.concatenate([undetermined, np.eye(flat.size)[hidden]])
+        undetermined = np.concatenate([undetermined, np.eye(jac.shape[1])[hidden]])
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
     # the parameter is undetermined
@@ -125,7 +125,7 @@ def uncertainty(
     by_paths = 0.0 if path_covariance is None else jac @ np.asarray(path_covariance, np.float64) @ jac.T
 
     def covariance(spread: np.ndarray) -> np.ndarray:
-        if count <= size(at):  # no entries are left to estimate variances from
+        if count <= jac.shape[1]:  # no entries are left to estimate variances from
             return np.full((len(jac),) * 2, np.inf)
         matrix = (jac @ spread) @ (jac @ spread).T + by_paths
         matrix[touched] = matrix[:, touched] = np.nan
