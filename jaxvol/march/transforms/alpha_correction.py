@@ -42,9 +42,9 @@ class AlphaCorrection(Transform):
         labels: also cut cells at the first and the last plane, half-way between nodes, where the label of the
             nearest node changes, so that the faces of a segmentation stay smooth under jitter. What lies
             between two labels of one cell has the label behind the first face. A frame takes about 1.5 to
-            2 times as long, and four bytes per label, computed once; 3 to 5 times as long with lighting,
-            under other modes than "over", on GPUs, and where labels are traced. Gradients include the motion
-            of exit and faces.
+            2 times as long, 2.3 to 3.5 times where many neighbours differ, as in thresholds of noise, and
+            four bytes per label, computed once; 3 to 5 times as long with lighting, under other modes than
+            "over", on GPUs, and where labels are traced. Gradients include the motion of exit and faces.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
